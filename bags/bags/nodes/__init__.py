@@ -1,0 +1,1 @@
+"""Connect recorded drives to ROS 2."""

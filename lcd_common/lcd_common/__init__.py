@@ -1,0 +1,1 @@
+"""Share SE(3), clouds, settings, trajectories and ROS plumbing between the packages of the suite."""

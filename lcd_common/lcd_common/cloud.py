@@ -1,0 +1,75 @@
+"""Hold a LiDAR sweep the way every core takes it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_common.errors import DataError
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points of one sweep in one frame.
+
+    Attributes:
+        xyz: [N x 3] float32, metres.
+        intensity: [N] float32 as the sensor gives it (KITTI: 0..1), or None.
+        time_s: [N] float32, seconds after the sweep's stamp (negative before it), or None where the
+            sensor does not say; never invented.
+    """
+
+    xyz: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None = None
+    time_s: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
+            raise DataError(f'points must have the shape N x 3, got {self.xyz.shape}')
+        for name in ('intensity', 'time_s'):
+            values = getattr(self, name)
+            if values is not None and values.shape != (len(self.xyz),):
+                raise DataError(
+                    f'{name} must have one value for each of the {len(self.xyz)} points, '
+                    f'got the shape {values.shape}'
+                )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def select(self, mask_or_index: NDArray[np.bool_] | NDArray[np.integer]) -> 'PointCloud':
+        """Return the chosen points with their intensity and time."""
+        return PointCloud(
+            self.xyz[mask_or_index],
+            None if self.intensity is None else self.intensity[mask_or_index],
+            None if self.time_s is None else self.time_s[mask_or_index],
+        )
+
+    def finite(self) -> 'PointCloud':
+        """Return the points without NaN or infinite coordinates (drivers mark missing returns so)."""
+        keep = np.isfinite(self.xyz).all(axis=1)
+        return self if keep.all() else self.select(keep)
+
+    def within(self, min_range: float, max_range: float) -> 'PointCloud':
+        """Return the points whose range lies in the interval, metres."""
+        squared = np.einsum('ij,ij->i', self.xyz, self.xyz)
+        return self.select((squared >= min_range**2) & (squared <= max_range**2))
+
+    def transformed(self, T_a_b: se3.Array) -> 'PointCloud':
+        """Return the cloud taken from frame b to frame a."""
+        xyz = se3.transform_points(T_a_b, self.xyz).astype(np.float32)
+        return replace(self, xyz=xyz)
+
+
+def voxel_first(xyz: NDArray[np.floating], voxel_size: float) -> NDArray[np.intp]:
+    """Return the indices of the first point in each voxel, in input order.
+
+    Keeping a measured point (not the voxel's mean) leaves thin structures where they are.
+    """
+    cell = np.floor(xyz / voxel_size).astype(np.int64)
+    cell -= cell.min(axis=0) if len(cell) else 0
+    spans = cell.max(axis=0) + 1 if len(cell) else np.ones(3, np.int64)
+    key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    _, first = np.unique(key, return_index=True)
+    return np.sort(first)

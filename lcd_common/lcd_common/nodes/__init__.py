@@ -1,0 +1,1 @@
+"""Connect cores to ROS 2: the only modules of this package that import rclpy or messages."""

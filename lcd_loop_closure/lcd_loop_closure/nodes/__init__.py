@@ -1,0 +1,1 @@
+"""Connect the cores of loop closure to ROS 2."""
