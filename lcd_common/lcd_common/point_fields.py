@@ -41,7 +41,9 @@ def structured(message: Any) -> NDArray[np.void]:
             }
         )
     except (KeyError, ValueError) as error:
-        raise DataError(f'PointCloud2 has an impossible layout of fields {names}: {error}') from None
+        raise DataError(
+            f'PointCloud2 has an impossible layout of fields {names}: {error}'
+        ) from None
     data = np.frombuffer(message.data, np.uint8)
     used = message.width * message.point_step
     row_step = message.row_step if message.height > 1 else used

@@ -23,7 +23,10 @@ def message(points: np.ndarray, height: int = 1, padding: int = 0, **changes: ob
     values = dict(
         fields=[
             SimpleNamespace(
-                name=name, offset=dtype.fields[name][1], datatype=CODES[dtype[name].str[1:]], count=1
+                name=name,
+                offset=dtype.fields[name][1],
+                datatype=CODES[dtype[name].str[1:]],
+                count=1,
             )
             for name in dtype.names
         ],

@@ -106,9 +106,7 @@ def test_ros_covariance_is_translation_first_about_the_parents_axes() -> None:
         np.diag(se3.ros_covariance(T_map_base, body)), [1.0, 4.0, 1.0, 0.2, 0.1, 0.3], atol=1e-12
     )
     S, T = random_covariance(), se3.exp(random_twist())
-    np.testing.assert_allclose(
-        se3.covariance_from_ros(T, se3.ros_covariance(T, S)), S, atol=1e-15
-    )
+    np.testing.assert_allclose(se3.covariance_from_ros(T, se3.ros_covariance(T, S)), S, atol=1e-15)
 
 
 def test_gtsam_covariance_is_rotation_first() -> None:

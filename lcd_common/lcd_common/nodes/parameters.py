@@ -48,7 +48,9 @@ def current_config(node: Node, cls: type[Config], prefix: str = '') -> Config:
     try:
         return from_mapping(cls, values)
     except ConfigError as error:
-        raise ConfigError(f'node {node.get_name()}: {prefix + "." if prefix else ""}{error}') from None
+        raise ConfigError(
+            f'node {node.get_name()}: {prefix + "." if prefix else ""}{error}'
+        ) from None
 
 
 def overrides(**values: object) -> list[Parameter]:
