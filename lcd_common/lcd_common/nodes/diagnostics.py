@@ -30,6 +30,7 @@ class Diagnostics:
         self._stamps: dict[str, deque[int]] = {}
         self._values: dict[str, Callable[[], object]] = {}
         self._problems: dict[str, tuple[bytes, str]] = {}
+        self.on_time: Callable[[str, float], None] | None = None  # hears every stage and its seconds
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', qos.RELIABLE)
         node.create_timer(1.0, self.publish)
 
@@ -61,6 +62,8 @@ class Diagnostics:
         """Note how long a stage took."""
         with self._lock:
             self._stages.setdefault(name, deque(maxlen=_WINDOW)).append(seconds)
+        if self.on_time is not None:
+            self.on_time(name, seconds)
 
     def watch(self, name: str, value: Callable[[], object]) -> None:
         """Report `value()` at every publication, e.g. a queue's length."""
@@ -81,6 +84,11 @@ class Diagnostics:
             else:
                 self._problems[problem] = (level, text)
 
+    def counts(self) -> dict[str, int]:
+        """Return every counter by its cause."""
+        with self._lock:
+            return dict(self._counts)
+
     def stage_times_ms(self) -> dict[str, list[float]]:
         """Return the recent times of every stage, milliseconds."""
         with self._lock:
@@ -97,7 +105,9 @@ class Diagnostics:
                     rows.append((f'{stream} rate [Hz]', f'{(len(stamps) - 1) / span:.2f}'))
             for name, times in self._stages.items():
                 p50, p99 = np.percentile(times, [50, 99]) * 1e3
-                rows.append((f'{name} median, p99 [ms]', f'{p50:.1f}, {p99:.1f}'))
+                # One number a row: plotting panels read them, pairs of numbers they do not.
+                rows.append((f'{name} median [ms]', f'{p50:.1f}'))
+                rows.append((f'{name} p99 [ms]', f'{p99:.1f}'))
         rows += [(name, str(value())) for name, value in self._values.items()]
         return DiagnosticStatus(
             level=max((level for level, _ in problems), default=DiagnosticStatus.OK),
