@@ -167,6 +167,18 @@ def compose_covariance(covariance_ab: Array, T_b_c: Array, covariance_bc: Array)
     return A @ covariance_ab @ A.T + covariance_bc
 
 
+def relative_covariance(covariance_oa: Array, T_a_b: Array, covariance_ob: Array) -> Array | None:
+    """Return the body-axes covariance of `T_a_b` that `compose_covariance` added between a and b.
+
+    None when the difference is not positive definite: then the two were not accumulated along the
+    path (a constant, zeros, a filter that was corrected in between) and say nothing about `T_a_b`.
+    """
+    A = adjoint(inverse(T_a_b))
+    added = covariance_ob - A @ covariance_oa @ A.T
+    added = 0.5 * (added + added.T)
+    return added if is_covariance(added) else None
+
+
 def invert_covariance(T_a_b: Array, covariance_ab: Array) -> Array:
     """Return the body-axes covariance of `T_b_a` from that of `T_a_b`."""
     A = adjoint(T_a_b)
