@@ -1,0 +1,1 @@
+"""Measure live ROS nodes."""
