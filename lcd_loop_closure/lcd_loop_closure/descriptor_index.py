@@ -1,0 +1,128 @@
+"""Find the keyframes whose descriptors are most alike."""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common.errors import DataError
+
+
+class Metric(Protocol):
+    """How descriptors are compared: `ScanContext` turns columns, `Euclidean` does not."""
+
+    @property
+    def row_length(self) -> int:
+        """Numbers that are stored for each descriptor."""
+
+    def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what has to be stored of a descriptor."""
+
+    def compare(
+        self, query: NDArray[np.float32], rows: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return distances [N] and, where the metric knows it, the query's yaw in each match."""
+
+
+class Euclidean:
+    """Compare fixed-length vectors by their L2 distance (LCDNet's descriptors, thesis 3.2)."""
+
+    def __init__(self, length: int) -> None:
+        self.row_length = length
+
+    def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the descriptor; raises DataError on another length."""
+        if descriptor.size != self.row_length:
+            raise DataError(
+                f'expected a descriptor of {self.row_length} numbers, got {descriptor.size}; '
+                'was the map made with another descriptor?'
+            )
+        return np.asarray(descriptor, np.float32).ravel()
+
+    def compare(
+        self, query: NDArray[np.float32], rows: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], None]:
+        """Return the distances [N]; a vector holds no yaw."""
+        return np.linalg.norm(rows - query, axis=1), None
+
+
+@dataclass(frozen=True)
+class Match:
+    """A keyframe that looks alike.
+
+    Attributes:
+        id: of the keyframe.
+        distance: of the descriptors, unit of the metric.
+        yaw: heading of the query in the match, radians; None when the metric does not tell.
+    """
+
+    id: int
+    distance: float
+    yaw: float | None
+
+
+class DescriptorIndex:
+    """Search all descriptors exactly, except those of the recent past.
+
+    Entries wait in a queue until the vehicle has travelled `delay_m` since they were added, so that
+    it does not recognise the place where it is. The distance is that of odometry along the path:
+    standing still or turning on the spot brings nothing in.
+    """
+
+    def __init__(self, metric: Metric, delay_m: float) -> None:
+        self.metric = metric
+        self.delay_m = delay_m
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._rows = np.empty((64, self.metric.row_length), np.float32)
+        self._ids = np.empty(64, np.int64)
+        self._size = 0
+        self._waiting: deque[tuple[int, float, NDArray[np.float32]]] = deque()
+
+    def __len__(self) -> int:
+        return self._size + len(self._waiting)
+
+    def add(self, id: int, descriptor: NDArray[np.float32], travelled_m: float) -> None:
+        """Queue a descriptor met after `travelled_m` of path; minus infinity: enter it at once."""
+        row = self.metric.row(descriptor)
+        if travelled_m == -np.inf:
+            self._insert(id, row)
+        else:
+            self._waiting.append((id, travelled_m, row))
+
+    def nearest(
+        self, descriptor: NDArray[np.float32], travelled_m: float, count: int
+    ) -> list[Match]:
+        """Return up to `count` matches that are old enough after `travelled_m`, nearest first."""
+        while self._waiting and travelled_m - self._waiting[0][1] >= self.delay_m:
+            id, _, row = self._waiting.popleft()
+            self._insert(id, row)
+        if not self._size:
+            return []
+        distance, yaw = self.metric.compare(self.metric.row(descriptor), self._rows[: self._size])
+        # Stable: equal distances come in the order in which they were seen.
+        order = np.argsort(distance, kind='stable')[:count]
+        return [
+            Match(int(self._ids[i]), float(distance[i]), None if yaw is None else float(yaw[i]))
+            for i in order
+            if np.isfinite(distance[i])
+        ]
+
+    def remove(self, id: int) -> None:
+        """Forget one keyframe; an unknown id is no error."""
+        keep = np.flatnonzero(self._ids[: self._size] != id)
+        self._rows[: len(keep)] = self._rows[keep]
+        self._ids[: len(keep)] = self._ids[keep]
+        self._size = len(keep)
+        self._waiting = deque(entry for entry in self._waiting if entry[0] != id)
+
+    def _insert(self, id: int, row: NDArray[np.float32]) -> None:
+        if self._size == len(self._ids):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+            self._ids = np.concatenate([self._ids, np.empty_like(self._ids)])
+        self._rows[self._size], self._ids[self._size] = row, id
+        self._size += 1

@@ -1,0 +1,150 @@
+"""Find keyframes near the current estimate.
+
+LIO-SAM's loop detection, which is the thesis's SLAM baseline.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_common.errors import DataError
+from lcd_common.settings import config, setting
+from lcd_loop_closure.keyframes import Keyframe
+
+
+@config
+class RadiusSearchConfig:
+    """How far a revisit is looked for."""
+
+    radius: float = setting(
+        15.0, 'keyframes nearer than this by the current estimate are candidates', unit='m', low=0.0
+    )
+    window: int = setting(
+        20, 'neighbouring keyframes that tell how the graph moved odometry', low=2
+    )
+
+
+@dataclass(frozen=True)
+class GraphPositions:
+    """Where the pose graph now believes the keyframes to be.
+
+    Attributes:
+        ids: [N] int64 of keyframes; need not hold the newest ones.
+        xyz: [N x 3] float64, metres, map frame.
+    """
+
+    ids: NDArray[np.int64]
+    xyz: se3.Array
+
+    def __post_init__(self) -> None:
+        if self.ids.ndim != 1 or self.xyz.shape != (len(self.ids), 3):
+            raise DataError(
+                f'{len(self.ids)} keyframe ids need as many positions x y z, got the shape '
+                f'{self.xyz.shape}'
+            )
+
+
+@dataclass(frozen=True)
+class NearbyKeyframe:
+    """A keyframe that lies near by the current estimate.
+
+    Attributes:
+        id: of the keyframe.
+        distance_m: from the query, by the estimate.
+        T_match_query: relative pose by the estimate.
+    """
+
+    id: int
+    distance_m: float
+    T_match_query: se3.Array
+
+
+class RadiusSearch:
+    """Search the graph's positions; orientations come from odometry, turned as the graph did.
+
+    The graph publishes positions alone. Around any keyframe, the path by odometry and the path by
+    the graph have the same shape, so aligning both over a short window (yaw and translation) gives
+    the local map -> odom transform and with it the full pose.
+    """
+
+    def __init__(self, settings: RadiusSearchConfig | None = None) -> None:
+        self.settings = settings or RadiusSearchConfig()
+
+    def nearest(
+        self,
+        query: Keyframe,
+        keyframes: Mapping[int, Keyframe],
+        eligible: Sequence[int],
+        graph: GraphPositions | None,
+        count: int,
+    ) -> list[NearbyKeyframe]:
+        """Return up to `count` of the `eligible` keyframes within the radius, nearest first.
+
+        Without a graph, odometry's own poses are the estimate.
+        """
+        if not len(eligible) or count < 1:
+            return []
+        positions = self._positions(keyframes, graph)
+        T_map_query = self._pose(query, keyframes, positions)
+        ids = np.array([i for i in eligible if i in positions], np.int64)
+        if not len(ids):
+            return []
+        away = np.linalg.norm(
+            np.array([positions[int(i)] for i in ids]) - T_map_query[:3, 3], axis=1
+        )
+        found = []
+        for at in np.argsort(away, kind='stable')[:count]:
+            if away[at] > self.settings.radius:
+                break
+            match = keyframes[int(ids[at])]
+            T_map_match = self._pose(match, keyframes, positions)
+            found.append(
+                NearbyKeyframe(match.id, float(away[at]), se3.inverse(T_map_match) @ T_map_query)
+            )
+        return found
+
+    @staticmethod
+    def _positions(
+        keyframes: Mapping[int, Keyframe], graph: GraphPositions | None
+    ) -> dict[int, se3.Array]:
+        if graph is None:
+            return {i: keyframe.T_odom_base[:3, 3] for i, keyframe in keyframes.items()}
+        return {int(i): xyz for i, xyz in zip(graph.ids, graph.xyz, strict=True)}
+
+    def _pose(
+        self,
+        keyframe: Keyframe,
+        keyframes: Mapping[int, Keyframe],
+        positions: Mapping[int, se3.Array],
+    ) -> se3.Array:
+        """Return T_map_base of a keyframe, even of one that the graph does not hold yet."""
+        half = self.settings.window // 2
+        around = range(keyframe.id - half, keyframe.id + half + 1)
+        known = [i for i in around if i in positions and i in keyframes]
+        if not known:
+            # Nothing near in the graph: the graph has not moved odometry as far as is known.
+            return keyframe.T_odom_base
+        odom = np.array([keyframes[i].T_odom_base[:3, 3] for i in known])
+        placed = np.array([positions[i] for i in known])
+        T_map_odom = _align(odom, placed)
+        T_map_base = T_map_odom @ keyframe.T_odom_base
+        # The alignment is a mean over the window; the nearest known keyframe is exact.
+        closest = int(np.argmin([abs(i - keyframe.id) for i in known]))
+        T_map_base[:3, 3] += placed[closest] - (
+            T_map_odom[:3, :3] @ odom[closest] + T_map_odom[:3, 3]
+        )
+        return T_map_base
+
+
+def _align(xyz_b: se3.Array, xyz_a: se3.Array) -> se3.Array:
+    """Return T_a_b of yaw and translation that brings points [N x 3] onto their twins."""
+    mean_a, mean_b = xyz_a.mean(axis=0), xyz_b.mean(axis=0)
+    a, b = xyz_a - mean_a, xyz_b - mean_b
+    sine = float(np.sum(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]))
+    cosine = float(np.sum(b[:, 0] * a[:, 0] + b[:, 1] * a[:, 1]))
+    T_a_b = se3.rotation_z(np.arctan2(sine, cosine) if np.hypot(sine, cosine) > 1e-9 else 0.0)
+    T_a_b[:3, 3] = mean_a - T_a_b[:3, :3] @ mean_b
+    return T_a_b

@@ -1,0 +1,145 @@
+"""Refine a rough relative pose by GICP and tell how sure the result is.
+
+Segal et al., "Generalized-ICP", RSS 2009, in small_gicp's implementation; one thread, so that the
+same clouds give the same pose to the last bit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_common.settings import config, setting
+
+
+@config
+class RefinementConfig:
+    """Settings of GICP and of its covariance."""
+
+    neighbours: int = setting(10, 'points from which the surface at a point is estimated', low=5)
+    coarse_gate: float = setting(
+        2.0, 'largest distance of partners in the first pass', unit='m', low=0.1
+    )
+    gate: float = setting(0.8, 'largest distance of partners in the last pass', unit='m', low=0.05)
+    max_iterations: int = setting(30, 'of each pass', low=1)
+    patch: float = setting(
+        2.0, 'residuals within patches of this size count as dependent', unit='m', low=0.1
+    )
+    sigma_floor: float = setting(
+        0.01, 'smallest standard deviation that is believed', unit='m', low=1e-4
+    )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A cloud made ready for registration: small_gicp's points with covariances, and their tree."""
+
+    points: small_gicp.PointCloud
+    tree: small_gicp.KdTree
+    xyz: NDArray[np.float64]
+
+    def nearest(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the index [N] of the nearest point to each of [N x 3] and its distance, metres."""
+        index, squared = self.tree.batch_nearest_neighbor_search(xyz)
+        return np.asarray(index, np.int64), np.sqrt(squared)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined pose.
+
+    Attributes:
+        T_match_query: pose of the query in the match, metres.
+        covariance: 6x6, body axes of the query, translation first; None when too few partners
+            constrain it.
+        converged: False when GICP ran out of iterations.
+    """
+
+    T_match_query: se3.Array
+    covariance: se3.Array | None
+    converged: bool
+
+
+class Refinement:
+    """Register clouds with a guess that is good to a metre or two and a few degrees."""
+
+    def __init__(self, settings: RefinementConfig | None = None) -> None:
+        self.settings = settings or RefinementConfig()
+
+    def surface(self, xyz: NDArray[np.floating]) -> Surface:
+        """Prepare points [N x 3]; needed once for each cloud."""
+        # A voxel far below the spacing of a reduced cloud keeps every point.
+        points, tree = small_gicp.preprocess_points(
+            np.asarray(xyz, np.float64), 1e-3, self.settings.neighbours, 1
+        )
+        return Surface(points, tree, np.asarray(points.points())[:, :3])
+
+    def refine(self, match: Surface, query: Surface, T_match_query: se3.Array) -> Refined:
+        """Refine `T_match_query`; wide partners first, then only near ones."""
+        s = self.settings
+        converged = False
+        for gate in (s.coarse_gate, s.gate):
+            result = small_gicp.align(
+                match.points,
+                query.points,
+                match.tree,
+                T_match_query,
+                max_correspondence_distance=gate,
+                num_threads=1,
+                max_iterations=s.max_iterations,
+            )
+            T_match_query, converged = np.asarray(result.T_target_source), result.converged
+        return Refined(T_match_query, self.covariance(match, query, T_match_query), converged)
+
+    def covariance(
+        self, match: Surface, query: Surface, T_match_query: se3.Array
+    ) -> se3.Array | None:
+        """Return the covariance of a refined pose, scaled to what the residuals really are.
+
+        The normal equations alone would trust ten thousand points as independent. Neighbours on a
+        wall err together: the residuals are summed patch by patch before they are squared (the
+        cluster-robust "sandwich" covariance H^-1 B H^-1).
+        """
+        s = self.settings
+        p_query = query.xyz
+        R = T_match_query[:3, :3]
+        moved = p_query @ R.T + T_match_query[:3, 3]
+        index, distance = match.nearest(moved)
+        near = np.flatnonzero(distance < s.gate)
+        if len(near) < 30:
+            return None
+        p_query, moved, index = p_query[near], moved[near], index[near]
+        spread_match = np.asarray(match.points.covs())[index, :3, :3]
+        spread_query = np.asarray(query.points.covs())[near, :3, :3]
+        weight = np.linalg.inv(spread_match + R @ spread_query @ R.T)
+        residual = match.xyz[index] - moved
+        # d(T exp(xi) p) / d xi = R [I, -hat(p)]
+        jacobian = np.empty((len(near), 3, 6))
+        jacobian[:, :, :3] = R
+        jacobian[:, :, 3:] = -R @ _hat(p_query)
+        weighted = np.swapaxes(jacobian, 1, 2) @ weight
+        H = (weighted @ jacobian).sum(axis=0)
+        gradient = np.einsum('nij,nj->ni', weighted, residual)
+        cell = np.floor(moved / s.patch).astype(np.int64)
+        _, patch = np.unique(cell, axis=0, return_inverse=True)
+        sums = np.zeros((int(patch.max()) + 1, 6))
+        np.add.at(sums, patch.ravel(), gradient)
+        try:
+            H_inverse = np.linalg.inv(H)
+        except np.linalg.LinAlgError:
+            return None
+        covariance = H_inverse @ (sums.T @ sums) @ H_inverse
+        lever = max(float(np.sqrt(np.mean(p_query[:, :2] ** 2))), 1.0)
+        floor = np.r_[np.full(3, s.sigma_floor**2), np.full(3, (s.sigma_floor / lever) ** 2)]
+        covariance = 0.5 * (covariance + covariance.T) + np.diag(floor)
+        return covariance if se3.is_covariance(covariance) else None
+
+
+def _hat(v: se3.Array) -> se3.Array:
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2] = -v[:, 2], v[:, 1]
+    out[:, 1, 0], out[:, 1, 2] = v[:, 2], -v[:, 0]
+    out[:, 2, 0], out[:, 2, 1] = -v[:, 1], v[:, 0]
+    return out
