@@ -59,7 +59,14 @@ def kiss_slam(sequence: Path, work: Path, max_range_m: float, min_range_m: float
     """
     out = work / f'kiss_slam_{sequence.parent.parent.name}.json'
     script = ROOT / 'benchmarks' / 'peer_kiss_slam.py'
-    command = [str(python()), str(script), str(sequence), str(out), str(max_range_m), str(min_range_m)]
+    command = [
+        str(python()),
+        str(script),
+        str(sequence),
+        str(out),
+        str(max_range_m),
+        str(min_range_m),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
         raise PeerError(f'KISS-SLAM failed on {sequence}: {done.stderr[-500:]}')

@@ -32,7 +32,9 @@ class LiveRecorder(Node):
         self.candidates: list[LoopConstraint] = []
         self.loops: list[LoopConstraint] = []
         self.T_map_base: dict[int, se3.Array] = {}
-        self.create_subscription(PointCloud2, 'points', self.on_points, qos.SENSOR_RELIABLE, raw=True)
+        self.create_subscription(
+            PointCloud2, 'points', self.on_points, qos.SENSOR_RELIABLE, raw=True
+        )
         self.create_subscription(Odometry, 'odom', self.on_odom, qos.RELIABLE)
         self.create_subscription(KeyframeMessage, 'keyframe', self.on_keyframe, qos.RELIABLE)
         self.create_subscription(
