@@ -19,7 +19,19 @@ setup(
     python_requires='>=3.11',
     # requirements/ pins everything; the suite's own packages are named in package.xml alone,
     # because pip would look for packages of these names elsewhere.
-    install_requires=['mcap', 'mcap-ros2-support', 'numpy', 'pillow', 'pyarrow', 'rosbags', 'tqdm'],
+    install_requires=[
+        'lz4',
+        'mcap',
+        'mcap-ros2-support',
+        'numpy',
+        'open3d',
+        'pillow',
+        'pyarrow',
+        'rosbags',
+        'scipy',
+        'tqdm',
+        'zstandard',
+    ],
     extras_require={'test': ['pytest']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

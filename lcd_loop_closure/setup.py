@@ -22,6 +22,7 @@ setup(
     install_requires=[
         'evo',
         'gtsam',
+        'jinja2',
         'kiss-icp',
         'matplotlib',
         'numpy',
