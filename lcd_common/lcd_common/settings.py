@@ -66,7 +66,8 @@ def setting(
     return dataclasses.field(default=default, metadata={_KEY: meaning})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(setting,))
+# `setting` is no field specifier: without the keyword default= checkers would take it for required.
+@dataclass_transform(frozen_default=True)
 def config(cls: type[Config]) -> type[Config]:
     """Make `cls` a frozen dataclass that checks its settings whenever it is built."""
 
