@@ -56,9 +56,14 @@ class CalibrationFile:
         values = self.matrix(name, 3, 4)
         return rigid(values[:, :3], values[:, 3], f'{self.path}: {name}')
 
-    def rotation_translation(self) -> se3.Array:
-        """Return the 4x4 transform of the entries R and T, as KITTI's raw recordings have them."""
-        return rigid(self.matrix('R', 3, 3), self.matrix('T', 3, 1)[:, 0], str(self.path))
+    def rotation_translation(self, suffix: str = '') -> se3.Array:
+        """Return the 4x4 transform of two entries R and T, as KITTI's raw recordings have them."""
+        R, t = self.matrix(f'R{suffix}', 3, 3), self.matrix(f'T{suffix}', 3, 1)
+        return rigid(R, t[:, 0], f'{self.path}: R{suffix}')
+
+    def rotation(self, name: str) -> NDArray[np.float64]:
+        """Return a 3x3 rotation matrix."""
+        return rigid(self.matrix(name, 3, 3), np.zeros(3), f'{self.path}: {name}')[:3, :3]
 
 
 def rigid(R: NDArray[np.float64], t: NDArray[np.float64], source: str) -> se3.Array:

@@ -50,6 +50,25 @@ def read_float32_cloud(path: Path) -> PointCloud:
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
+def read_text_cloud(path: Path) -> PointCloud:
+    """Read a text file of `x y z reflectance` rows (KITTI's unsynchronised sweeps).
+
+    Raises:
+        UnreadableError: a row has another count of numbers, or the file is gone.
+    """
+    try:
+        rows = np.loadtxt(path, np.float32, ndmin=2)
+    except OSError as error:
+        raise UnreadableError('unreadable scan file', f'{path}: {error.strerror}') from None
+    except ValueError as error:
+        raise UnreadableError('unreadable scan file', f'{path}: {error}') from None
+    if rows.size and rows.shape[1] != 4:
+        message = f'{path}: a row has 4 numbers, got {rows.shape[1]}'
+        raise UnreadableError('unreadable scan file', message)
+    rows = rows.reshape(-1, 4)
+    return PointCloud(np.ascontiguousarray(rows[:, :3]), rows[:, 3].copy())
+
+
 def read_image(path: Path) -> NDArray[np.uint8]:
     """Read an image file as grey [H x W] or RGB [H x W x 3].
 
