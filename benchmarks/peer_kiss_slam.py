@@ -1,4 +1,4 @@
-"""Run KISS-SLAM on a KITTI folder; executed by the peers' own Python, so it imports nothing of ours.
+"""Run KISS-SLAM on a KITTI folder; the peers' own Python does, so nothing of ours is imported.
 
     python peer_kiss_slam.py SEQUENCE_FOLDER OUT.json [max_range] [min_range]
 

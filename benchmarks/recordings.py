@@ -12,7 +12,7 @@ RESULTS = ROOT / 'benchmarks' / 'results'
 
 
 def folder() -> Path:
-    """Return the folder that holds `data` and `tools`: $RECORDINGS, or `shared` beside the repository.
+    """Return the folder that holds `data` and `tools`: $RECORDINGS or ../shared.
 
     Raises:
         DataError: it is not there.

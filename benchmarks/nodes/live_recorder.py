@@ -12,8 +12,8 @@ from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint
 from lcd_loop_closure.nodes.conversions import keyframe_from_message, loop_from_message
 from lcd_msgs.msg import Keyframe as KeyframeMessage
-from lcd_msgs.msg import LoopConstraintArray
 from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
+from lcd_msgs.msg import LoopConstraintArray
 
 
 class LiveRecorder(Node):

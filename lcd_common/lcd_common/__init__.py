@@ -1,1 +1,1 @@
-"""Share SE(3), clouds, settings, trajectories and ROS plumbing between the packages of the suite."""
+"""Share SE(3), clouds, settings, trajectories and ROS plumbing between the packages."""

@@ -1,6 +1,7 @@
 """Hold a LiDAR sweep the way every core takes it."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def select(self, mask_or_index: NDArray[np.bool_] | NDArray[np.integer]) -> 'PointCloud':
+    def select(self, mask_or_index: NDArray[Any]) -> 'PointCloud':
         """Return the chosen points with their intensity and time."""
         return PointCloud(
             self.xyz[mask_or_index],
@@ -47,7 +48,7 @@ class PointCloud:
         )
 
     def finite(self) -> 'PointCloud':
-        """Return the points without NaN or infinite coordinates (drivers mark missing returns so)."""
+        """Return the points without NaN or infinite coordinates (drivers mark no return so)."""
         keep = np.isfinite(self.xyz).all(axis=1)
         return self if keep.all() else self.select(keep)
 

@@ -1,4 +1,4 @@
-"""Run a command the way a user expects: known mistakes are one line, defects keep their traceback."""
+"""Run a command as users expect: known mistakes are one line, defects keep their traceback."""
 
 import logging
 import sys
@@ -8,7 +8,7 @@ from lcd_common.errors import LocalizationError
 
 
 def run(command: Callable[[], int | None]) -> int:
-    """Call `command`; a LocalizationError or a missing file becomes one line on stderr and status 1.
+    """Call `command`; a LocalizationError or a missing file becomes one line and status 1.
 
     Returns the process's exit status: the command's own, 0 for None, 130 after Ctrl-C.
     """

@@ -1,7 +1,7 @@
 """Read and lay out the bytes of a sensor_msgs/PointCloud2 without importing ROS.
 
-rclpy, rosbags and mcap each have a PointCloud2 class of their own; all have the same attributes, and
-only these are used here.
+rclpy, rosbags and mcap each have a PointCloud2 class of their own; all have the same attributes,
+and only these are used here.
 """
 
 from typing import Any

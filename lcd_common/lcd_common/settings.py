@@ -53,8 +53,8 @@ def setting(
     """Declare a field of a config dataclass.
 
     Args:
-        default: its default; the type of the default is the type of the parameter (bool, int, float,
-            str, or tuple of one of these).
+        default: its default; the type of the default is the type of the parameter (bool, int,
+            float, str, or tuple of one of these).
         description: one phrase for people, without the unit.
         unit: e.g. 'm', 's', 'rad'; empty for counts, shares and names.
         low: smallest allowed value, inclusive.
@@ -79,7 +79,8 @@ def config(cls: type[Config]) -> type[Config]:
                 object.__setattr__(self, field.name, float(value))
             elif not isinstance(value, expected) or (expected is int and isinstance(value, bool)):
                 raise ConfigError(
-                    f'{field.name} must be {expected.__name__}, got {type(value).__name__} {value!r}'
+                    f'{field.name} must be {expected.__name__}, '
+                    f'got {type(value).__name__} {value!r}'
                 )
             meaning_of(field).check(field.name, getattr(self, field.name))
 
@@ -94,7 +95,7 @@ def meaning_of(field: 'dataclasses.Field[Any]') -> Setting:
 
 
 def from_mapping(cls: type[Config], values: Mapping[str, Any]) -> Config:
-    """Build a config from names and values; unknown names raise ConfigError naming the known ones."""
+    """Build a config from names and values; an unknown name raises ConfigError."""
     known = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     unknown = sorted(set(values) - set(known))
     if unknown:

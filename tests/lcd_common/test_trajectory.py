@@ -1,5 +1,6 @@
 """Trajectories interpolate on SE(3) and survive their files; evo is the second reader."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_in_frame_and_length() -> None:
         moved.T_world_body[7], T_new_world @ drive().T_world_body[7] @ T_body_sensor, atol=1e-12
     )
     assert drive().length_m == pytest.approx(
-        sum(np.linalg.norm(a - b) for a, b in zip(drive().positions, drive().positions[1:]))
+        sum(np.linalg.norm(a - b) for a, b in itertools.pairwise(drive().positions))
     )
 
 

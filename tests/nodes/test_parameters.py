@@ -40,7 +40,10 @@ def test_only_live_settings_change_and_only_within_their_range() -> None:
     node = Node('p')
     try:
         declare_config(node, Example)
-        set_parameter = lambda name, value: node.set_parameters([Parameter(name, value=value)])[0]
+
+        def set_parameter(name, value):
+            return node.set_parameters([Parameter(name, value=value)])[0]
+
         assert set_parameter('limit', 0.9).successful
         assert not set_parameter('limit', -1.0).successful
         assert not set_parameter('size', 1.0).successful

@@ -1,4 +1,4 @@
-"""The worker keeps order, drops the oldest, survives bad items, and is immediate without a thread."""
+"""The worker keeps order, drops the oldest, survives bad items; without a thread it works at once."""
 
 import threading
 

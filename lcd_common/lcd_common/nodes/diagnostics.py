@@ -30,7 +30,7 @@ class Diagnostics:
         self._stamps: dict[str, deque[int]] = {}
         self._values: dict[str, Callable[[], object]] = {}
         self._problems: dict[str, tuple[bytes, str]] = {}
-        self.on_time: Callable[[str, float], None] | None = None  # hears every stage and its seconds
+        self.on_time: Callable[[str, float], None] | None = None  # hears every stage
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', qos.RELIABLE)
         node.create_timer(1.0, self.publish)
 

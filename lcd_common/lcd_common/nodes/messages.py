@@ -48,7 +48,7 @@ def points_message(
     """Make a PointCloud2 from a structured array [N] and its (name, offset, datatype) fields."""
     # An array('B') is taken over as it is; assigning bytes would be checked byte by byte.
     data = array.array('B')
-    data.frombytes(memoryview(np.ascontiguousarray(points)).cast('B'))
+    data.frombytes(np.ascontiguousarray(points).view(np.uint8).data)
     return PointCloud2(
         header=header(stamp, frame_id),
         height=1,

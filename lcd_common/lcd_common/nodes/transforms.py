@@ -85,8 +85,8 @@ class TransformAuthority:
                 continue
             self.rivals += 1
             self._log.error(
-                f'another node publishes {self.parent} -> {self.child} on /tf: two authorities make '
-                'the vehicle jump; set publish_tf:=false on one of them',
+                f'another node publishes {self.parent} -> {self.child} on /tf: two authorities '
+                'make the vehicle jump; set publish_tf:=false on one of them',
                 throttle_duration_sec=10.0,
             )
 

@@ -11,8 +11,8 @@ Item = TypeVar('Item')
 class Worker(Generic[Item]):
     """Hand items to `work` in order, on a thread of its own or (`threaded=False`) right away.
 
-    Without a thread `put` returns when the work is done: that is what lock-step replay needs to give
-    the same answer on every run.
+    Without a thread `put` returns when the work is done: that is what lock-step replay needs to
+    give the same answer on every run.
     """
 
     def __init__(
@@ -101,5 +101,5 @@ class Worker(Generic[Item]):
     def _do(self, item: Item) -> None:
         try:
             self._work(item)
-        except Exception as error:  # the boundary: one bad item must not stop the node
+        except Exception as error:  # noqa: BLE001 one bad item must not stop the node
             self._on_error(error)
