@@ -1,0 +1,1 @@
+"""Look at a drive afterwards: numbers, pictures, one page to read."""
