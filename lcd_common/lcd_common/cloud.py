@@ -49,7 +49,7 @@ class PointCloud:
 
     def finite(self) -> 'PointCloud':
         """Return the points without NaN or infinite coordinates (drivers mark no return so)."""
-        keep = np.isfinite(self.xyz).all(axis=1)
+        keep = np.asarray(np.isfinite(self.xyz).all(axis=1))
         return self if keep.all() else self.select(keep)
 
     def within(self, min_range: float, max_range: float) -> 'PointCloud':

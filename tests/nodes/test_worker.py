@@ -1,4 +1,4 @@
-"""The worker keeps order, drops the oldest, survives bad items; without a thread it works at once."""
+"""The worker keeps order, drops the oldest and survives bad items; threadless it is immediate."""
 
 import threading
 
