@@ -1,17 +1,14 @@
 """Hold all that a pose graph has measured, as arrays that can be saved, sent and solved elsewhere."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common import se3
-from lcd_common.errors import MapError
-from lcd_loop_closure.gnss import GnssAlignment, GnssFactor
-from lcd_loop_closure.loop import LoopConstraint, LoopStatus
+from lcd_loop_closure.gnss import GnssDatum, GnssFactor
+from lcd_loop_closure.loop import LoopConstraint
 
 
 class LoopState(IntEnum):
@@ -22,6 +19,7 @@ class LoopState(IntEnum):
     CONFIRMED = 2  # found right by the solver, in the graph
     REJECTED = 3  # found wrong by the solver, outside the graph
     BY_HAND = 4  # put in by a person, in the graph; the solver does not judge it
+    UNUSED = 5  # rejected before it came here, or taken out by a person; only remembered
 
 
 IN_GRAPH = frozenset({LoopState.TENTATIVE, LoopState.CONFIRMED, LoopState.BY_HAND})
@@ -41,6 +39,12 @@ class GraphLoop:
         """The ids of both keyframes, match first."""
         return self.constraint.match_id, self.constraint.query_id
 
+    @property
+    def T_match_query(self) -> se3.Array:
+        """The measured transform; only loops that are never used may lack it."""
+        assert self.constraint.T_match_query is not None
+        return self.constraint.T_match_query
+
 
 @dataclass(frozen=True)
 class GraphSnapshot:
@@ -56,7 +60,8 @@ class GraphSnapshot:
         broken_links: ids of keyframes whose link to their predecessor was found broken.
         loops: every loop that was offered, in order of arrival.
         gnss: satellite fixes tied to keyframes.
-        gnss_alignment: datum and T_enu_map, None before it is known.
+        gnss_datum: origin of the ENU frame; None before the first fix.
+        T_enu_map: where the map lies in it; None before it is known, and the fixes do not act.
     """
 
     ids: NDArray[np.int64]
@@ -68,7 +73,8 @@ class GraphSnapshot:
     broken_links: tuple[int, ...] = ()
     loops: tuple[GraphLoop, ...] = ()
     gnss: tuple[GnssFactor, ...] = ()
-    gnss_alignment: GnssAlignment | None = None
+    gnss_datum: GnssDatum | None = None
+    T_enu_map: se3.Array | None = None
 
     def __len__(self) -> int:
         return len(self.ids)

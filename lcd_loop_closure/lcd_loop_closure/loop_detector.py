@@ -4,23 +4,30 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
 from lcd_common.settings import config, setting
-from lcd_loop_closure.bev_registration import BevConfig, BevRegistration, BevView
+from lcd_loop_closure.bev_registration import BevConfig
 from lcd_loop_closure.descriptor_index import DescriptorIndex
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint, LoopStatus
+from lcd_loop_closure.pair_registration import (
+    PairConfig,
+    PairRegistration,
+    PairResult,
+    PreparedCloud,
+    Timer,
+)
 from lcd_loop_closure.radius_search import GraphPositions, RadiusSearch, RadiusSearchConfig
 from lcd_loop_closure.reduction import ReductionConfig, reduce_cloud
-from lcd_loop_closure.refinement import Refined, Refinement, RefinementConfig, Surface
+from lcd_loop_closure.refinement import RefinementConfig
 from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
-from lcd_loop_closure.verification import RangeView, Verdict, Verification, VerificationConfig
+from lcd_loop_closure.verification import VerificationConfig
 
-Timer = Callable[[str], AbstractContextManager[object]]
 Gate = Callable[[Keyframe, Keyframe], str | None]
 
 
@@ -37,8 +44,8 @@ class LoopDetectorConfig:
     delay: float = setting(
         30.0, 'keyframes met within this distance of travel are no loop candidates', unit='m', low=0
     )
-    min_bev_score: float = setting(
-        0.2, 'views from above that correlate less are not refined', low=0.0, high=1.0
+    spread: float = setting(
+        10.0, 'candidates are at least this far apart along the path', unit='m', low=0.0
     )
     cached_clouds: int = setting(16, 'matches kept ready for registration', low=1)
 
@@ -51,6 +58,7 @@ class LoopDetectorSettings:
     reduction: ReductionConfig = field(default_factory=ReductionConfig)
     descriptor: ScanContextConfig = field(default_factory=ScanContextConfig)
     radius: RadiusSearchConfig = field(default_factory=RadiusSearchConfig)
+    pair: PairConfig = field(default_factory=PairConfig)
     registration: BevConfig = field(default_factory=BevConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
@@ -61,15 +69,6 @@ class _Candidate:
     id: int
     found_by: str
     descriptor_distance: float | None = None
-
-
-@dataclass(frozen=True)
-class _Prepared:
-    """What registration and verification need of a cloud and that depends on it alone."""
-
-    bev: BevView
-    surface: Surface
-    range_view: RangeView
 
 
 class LoopDetector:
@@ -108,18 +107,24 @@ class LoopDetector:
         self._descriptor = ScanContext(s.descriptor)
         self._index = DescriptorIndex(self._descriptor, s.detector.delay)
         self._radius = RadiusSearch(s.radius)
-        self._registration = BevRegistration(s.registration)
-        self._refinement = Refinement(s.refinement)
-        self._verification = Verification(s.verification, sensor_origin)
+        self._pairs = PairRegistration(
+            s.pair,
+            s.registration,
+            s.refinement,
+            s.verification,
+            sensor_origin=sensor_origin,
+            timer=timer,
+        )
         self.reset()
 
     def reset(self) -> None:
         """Forget every keyframe."""
         self._keyframes: dict[int, Keyframe] = {}
         self._travelled_m: dict[int, float] = {}
+        self._restored: set[int] = set()
         self._path_m = 0.0
         self._index.clear()
-        self._ready: OrderedDict[int, _Prepared] = OrderedDict()
+        self._ready: OrderedDict[int, PreparedCloud] = OrderedDict()
 
     @property
     def size(self) -> int:
@@ -153,12 +158,13 @@ class LoopDetector:
         Those without a descriptor of this detector's method get one from their reduced cloud.
         """
         for keyframe in keyframes:
-            self._remember(keyframe, -np.inf)
+            self._remember(self._arrive(keyframe), restored=True)
 
     def forget(self, id: int) -> None:
         """Forget one keyframe; an unknown id is no error."""
         self._keyframes.pop(id, None)
         self._travelled_m.pop(id, None)
+        self._restored.discard(id)
         self._ready.pop(id, None)
         self._index.remove(id)
 
@@ -180,19 +186,19 @@ class LoopDetector:
         with self._timer('retrieve'):
             candidates = self._candidates(keyframe, graph)
         loops = self._try(keyframe, candidates)
-        self._remember(keyframe, self._path_m)
+        self._remember(keyframe)
         return loops
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take in a keyframe without looking for loops."""
-        self._remember(self._arrive(keyframe), self._path_m)
+        self._remember(self._arrive(keyframe))
 
     def compare(self, match: Keyframe, query: Keyframe) -> LoopConstraint:
         """Register and verify one pair of keyframes, whatever retrieval says of them."""
-        query = self._described(query)
-        return self._evaluate(
-            match, query, _Candidate(match.id, 'pair'), self._prepare(query), None
+        pair = self._pairs.compare(
+            self._pairs.prepare(match.cloud.xyz), self._pairs.prepare(query.cloud.xyz)
         )
+        return _constraint(match, query, _Candidate(match.id, 'pair'), pair)
 
     def _arrive(self, keyframe: Keyframe) -> Keyframe:
         self._path_m += float(np.linalg.norm(keyframe.T_previous_this[:3, 3]))
@@ -204,147 +210,101 @@ class LoopDetector:
             return keyframe
         return replace(keyframe, descriptor=self.describe(keyframe.cloud), descriptor_method=method)
 
-    def _remember(self, keyframe: Keyframe, travelled_m: float) -> None:
-        keyframe = self._described(keyframe)
+    def _remember(self, keyframe: Keyframe, restored: bool = False) -> None:
         assert keyframe.descriptor is not None
         if keyframe.id in self._keyframes:
             self.forget(keyframe.id)
         self._keyframes[keyframe.id] = keyframe
-        self._travelled_m[keyframe.id] = travelled_m
-        self._index.add(keyframe.id, keyframe.descriptor, travelled_m)
+        self._travelled_m[keyframe.id] = self._path_m
+        if restored:
+            self._restored.add(keyframe.id)
+        entered_m = -np.inf if restored else self._path_m
+        self._index.add(keyframe.id, keyframe.descriptor, entered_m)
 
     def _candidates(self, query: Keyframe, graph: GraphPositions | None) -> list[_Candidate]:
-        """Return candidates: radius and descriptor in turn, the radius first, no id twice."""
+        """Return candidates: radius and descriptor in turn, the radius first, no place twice."""
         s = self.settings.detector
         assert query.descriptor is not None
-        looked = []
+        wanted = 10 * s.max_candidates  # neighbours of each other, most of them
+        by_descriptor, by_radius = [], []
         if s.by_descriptor:
-            looked = self._index.nearest(query.descriptor, self._path_m, s.max_candidates)
-        near = []
+            for match in self._index.nearest(query.descriptor, self._path_m, wanted):
+                by_descriptor.append(_Candidate(match.id, self.descriptor_method, match.distance))
         if s.by_radius:
-            newest = self._path_m - s.delay
-            eligible = [i for i, metres in self._travelled_m.items() if metres <= newest]
-            near = self._radius.nearest(query, self._keyframes, eligible, graph, s.max_candidates)
-        by_descriptor = [_Candidate(m.id, self.descriptor_method, m.distance) for m in looked]
-        by_radius = [_Candidate(n.id, 'radius') for n in near]
-        merged: dict[int, _Candidate] = {}
-        for i in range(s.max_candidates):
-            for candidate in (*by_radius[i : i + 1], *by_descriptor[i : i + 1]):
-                merged.setdefault(candidate.id, candidate)
-        return list(merged.values())[: s.max_candidates]
+            newest_m = self._path_m - s.delay
+            eligible = [
+                id
+                for id, travelled_m in self._travelled_m.items()
+                if travelled_m <= newest_m or id in self._restored
+            ]
+            for near in self._radius.nearest(query, self._keyframes, eligible, graph, wanted):
+                by_radius.append(_Candidate(near.id, 'radius'))
+        chosen: list[_Candidate] = []
+        for pair in zip_longest(by_radius, by_descriptor):
+            for candidate in pair:
+                if candidate is not None and self._elsewhere(candidate, chosen):
+                    chosen.append(candidate)
+        return chosen[: s.max_candidates]
 
-    def _try(self, query: Keyframe, candidates: list[_Candidate]) -> list[LoopConstraint]:
-        limit = self.settings.detector.max_descriptor_distance
-        loops: list[LoopConstraint] = []
-        prepared: _Prepared | None = None
-        spectra = None
-        for candidate in candidates:
-            match = self._keyframes[candidate.id]
-            distance = candidate.descriptor_distance
-            if distance is not None and distance > limit:
-                reason = f'descriptor distance {distance:.2f} exceeds {limit:g}'
-                loops.append(
-                    _constraint(match, query, candidate, LoopStatus.REJECTED_DESCRIPTOR, reason)
-                )
-                continue
-            veto = self._gate(query, match) if self._gate else None
-            if veto is not None:
-                loops.append(
-                    _constraint(match, query, candidate, LoopStatus.REJECTED_UNCERTAIN, veto)
-                )
-                continue
-            if prepared is None:
-                with self._timer('register'):
-                    prepared = self._prepare(query)
-                    spectra = self._registration.spectra(prepared.bev)
-            loops.append(self._evaluate(match, query, candidate, prepared, spectra))
-            if loops[-1].accepted:
-                break
-        if prepared is not None:
-            self._keep_ready(query.id, prepared)
-        return loops
-
-    def _evaluate(
-        self,
-        match: Keyframe,
-        query: Keyframe,
-        candidate: _Candidate,
-        prepared: _Prepared,
-        spectra: NDArray[np.complex64] | None,
-    ) -> LoopConstraint:
-        with self._timer('register'):
-            target = self._ready.get(match.id) or self._prepare(match)
-            self._keep_ready(match.id, target)
-            if spectra is None:
-                spectra = self._registration.spectra(prepared.bev)
-            hypotheses = self._registration.search(target.bev, spectra, prepared.bev)
-        best = hypotheses[0].score if hypotheses else 0.0
-        limit = self.settings.detector.min_bev_score
-        if not hypotheses or best < limit:
-            return _constraint(
-                match,
-                query,
-                candidate,
-                LoopStatus.REJECTED_REGISTRATION,
-                f'views from above correlate {best:.2f}, below {limit:g}',
-            )
-        with self._timer('refine'):
-            refined = self._refinement.refine(
-                target.surface, prepared.surface, hypotheses[0].T_match_query
-            )
-        with self._timer('verify'):
-            verdict = self._verification.check(
-                target.surface,
-                prepared.surface,
-                target.range_view,
-                prepared.range_view,
-                refined.T_match_query,
-                (target.bev.ground_z, prepared.bev.ground_z),
-            )
-        return _verified(match, query, candidate, refined, verdict)
-
-    def _prepare(self, keyframe: Keyframe) -> _Prepared:
-        xyz = keyframe.cloud.xyz
-        surface = self._refinement.surface(xyz)
-        return _Prepared(
-            self._registration.view(xyz), surface, self._verification.range_view(surface)
+    def _elsewhere(self, candidate: _Candidate, chosen: list[_Candidate]) -> bool:
+        at = self._travelled_m[candidate.id]
+        spread = self.settings.detector.spread
+        return all(
+            candidate.id != other.id and abs(at - self._travelled_m[other.id]) >= spread
+            for other in chosen
         )
 
-    def _keep_ready(self, id: int, prepared: _Prepared) -> None:
-        self._ready[id] = prepared
-        self._ready.move_to_end(id)
+    def _try(self, query: Keyframe, candidates: list[_Candidate]) -> list[LoopConstraint]:
+        loops: list[LoopConstraint] = []
+        prepared: PreparedCloud | None = None
+        for candidate in candidates:
+            match = self._keyframes[candidate.id]
+            rejection = self._screen(query, match, candidate)
+            if rejection is not None:
+                loops.append(_constraint(match, query, candidate, rejection))
+                continue
+            prepared = prepared or self._pairs.prepare(query.cloud.xyz)
+            pair = self._pairs.compare(self._prepared(match), prepared)
+            loops.append(_constraint(match, query, candidate, pair))
+            if pair.status is LoopStatus.ACCEPTED:
+                break
+        return loops
+
+    def _screen(self, query: Keyframe, match: Keyframe, candidate: _Candidate) -> PairResult | None:
+        """Reject a candidate before the expensive stages, or return None."""
+        limit = self.settings.detector.max_descriptor_distance
+        distance = candidate.descriptor_distance
+        if distance is not None and distance > limit:
+            reason = f'descriptor distance {distance:.2f} exceeds {limit:g}'
+            return PairResult(LoopStatus.REJECTED_DESCRIPTOR, reason)
+        veto = self._gate(query, match) if self._gate else None
+        return None if veto is None else PairResult(LoopStatus.REJECTED_UNCERTAIN, veto)
+
+    def _prepared(self, keyframe: Keyframe) -> PreparedCloud:
+        prepared = self._ready.pop(keyframe.id, None) or self._pairs.prepare(keyframe.cloud.xyz)
+        self._ready[keyframe.id] = prepared
         while len(self._ready) > self.settings.detector.cached_clouds:
             self._ready.popitem(last=False)
+        return prepared
 
 
 def _constraint(
-    match: Keyframe, query: Keyframe, candidate: _Candidate, status: LoopStatus, reason: str
+    match: Keyframe, query: Keyframe, candidate: _Candidate, pair: PairResult
 ) -> LoopConstraint:
+    verdict = pair.verdict
     return LoopConstraint(
         match_id=match.id,
         query_id=query.id,
         match_stamp_ns=match.stamp_ns,
         query_stamp_ns=query.stamp_ns,
+        T_match_query=pair.T_match_query,
+        covariance=pair.covariance,
         descriptor_distance=candidate.descriptor_distance,
-        method=f'{candidate.found_by}+bev+gicp',
-        status=status,
-        reason=reason,
-    )
-
-
-def _verified(
-    match: Keyframe, query: Keyframe, candidate: _Candidate, refined: Refined, verdict: Verdict
-) -> LoopConstraint:
-    status, reason = verdict.status, verdict.reason
-    if status is LoopStatus.ACCEPTED and refined.covariance is None:
-        status = LoopStatus.REJECTED_REGISTRATION
-        reason = 'the clouds do not constrain all six degrees of freedom'
-    return replace(
-        _constraint(match, query, candidate, status, reason),
-        T_match_query=refined.T_match_query,
-        covariance=refined.covariance,
-        fitness=verdict.fitness,
-        rmse_m=verdict.rmse_m,
-        inliers=verdict.inliers,
-        overlap=verdict.overlap,
+        fitness=None if verdict is None else verdict.fitness,
+        rmse_m=None if verdict is None else verdict.rmse_m,
+        inliers=0 if verdict is None else verdict.inliers,
+        overlap=None if verdict is None else verdict.overlap,
+        method=f'{candidate.found_by}+{PairRegistration.method}',
+        status=pair.status,
+        reason=pair.reason,
     )

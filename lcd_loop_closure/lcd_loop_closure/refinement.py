@@ -19,8 +19,9 @@ class RefinementConfig:
     """Settings of GICP and of its covariance."""
 
     neighbours: int = setting(10, 'points from which the surface at a point is estimated', low=5)
-    coarse_gate: float = setting(
-        2.0, 'largest distance of partners in the first pass', unit='m', low=0.1
+    rough_voxel: float = setting(1.0, 'spacing of points in the rough pass', unit='m', low=0.05)
+    rough_gate: float = setting(
+        2.0, 'largest distance of partners in the rough pass', unit='m', low=0.1
     )
     gate: float = setting(0.8, 'largest distance of partners in the last pass', unit='m', low=0.05)
     max_iterations: int = setting(30, 'of each pass', low=1)
@@ -34,11 +35,16 @@ class RefinementConfig:
 
 @dataclass(frozen=True)
 class Surface:
-    """A cloud made ready for registration: small_gicp's points with covariances, and their tree."""
+    """A cloud made ready for registration: small_gicp's points with covariances, and their tree.
+
+    `rough_points` and `rough_tree` are the same, thinned.
+    """
 
     points: small_gicp.PointCloud
     tree: small_gicp.KdTree
     xyz: NDArray[np.float64]
+    rough_points: small_gicp.PointCloud
+    rough_tree: small_gicp.KdTree
 
     def nearest(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the index [N] of the nearest point to each of [N x 3] and its distance, metres."""
@@ -52,13 +58,10 @@ class Refined:
 
     Attributes:
         T_match_query: pose of the query in the match, metres.
-        covariance: 6x6, body axes of the query, translation first; None when too few partners
-            constrain it.
         converged: False when GICP ran out of iterations.
     """
 
     T_match_query: se3.Array
-    covariance: se3.Array | None
     converged: bool
 
 
@@ -71,36 +74,51 @@ class Refinement:
     def surface(self, xyz: NDArray[np.floating]) -> Surface:
         """Prepare points [N x 3]; needed once for each cloud."""
         # A voxel far below the spacing of a reduced cloud keeps every point.
-        points, tree = small_gicp.preprocess_points(
-            np.asarray(xyz, np.float64), 1e-3, self.settings.neighbours, 1
+        s = self.settings
+        xyz = np.asarray(xyz, np.float64)
+        points, tree = small_gicp.preprocess_points(xyz, 1e-3, s.neighbours, 1)
+        rough = small_gicp.preprocess_points(xyz, s.rough_voxel, s.neighbours, 1)
+        return Surface(points, tree, np.asarray(points.points())[:, :3], *rough)
+
+    def approach(self, match: Surface, query: Surface, T_match_query: se3.Array) -> se3.Array:
+        """Bring a guess from the global registration near, with few points and wide partners."""
+        s = self.settings
+        result = small_gicp.align(
+            match.rough_points,
+            query.rough_points,
+            match.rough_tree,
+            T_match_query,
+            max_correspondence_distance=s.rough_gate,
+            num_threads=1,
+            max_iterations=s.max_iterations,
+            rotation_epsilon=0.005,
+            translation_epsilon=0.02,
         )
-        return Surface(points, tree, np.asarray(points.points())[:, :3])
+        return np.asarray(result.T_target_source)
 
     def refine(self, match: Surface, query: Surface, T_match_query: se3.Array) -> Refined:
-        """Refine `T_match_query`; wide partners first, then only near ones."""
+        """Refine a pose that `approach` brought near."""
         s = self.settings
-        converged = False
-        for gate in (s.coarse_gate, s.gate):
-            result = small_gicp.align(
-                match.points,
-                query.points,
-                match.tree,
-                T_match_query,
-                max_correspondence_distance=gate,
-                num_threads=1,
-                max_iterations=s.max_iterations,
-            )
-            T_match_query, converged = np.asarray(result.T_target_source), result.converged
-        return Refined(T_match_query, self.covariance(match, query, T_match_query), converged)
+        result = small_gicp.align(
+            match.points,
+            query.points,
+            match.tree,
+            T_match_query,
+            max_correspondence_distance=s.gate,
+            num_threads=1,
+            max_iterations=s.max_iterations,
+        )
+        T_match_query = np.asarray(result.T_target_source)
+        return Refined(T_match_query, bool(result.converged))
 
     def covariance(
         self, match: Surface, query: Surface, T_match_query: se3.Array
     ) -> se3.Array | None:
-        """Return the covariance of a refined pose, scaled to what the residuals really are.
+        """Return the 6x6 covariance of a refined pose (body axes, translation first), or None.
 
         The normal equations alone would trust ten thousand points as independent. Neighbours on a
         wall err together: the residuals are summed patch by patch before they are squared (the
-        cluster-robust "sandwich" covariance H^-1 B H^-1).
+        cluster-robust "sandwich" covariance H^-1 B H^-1). None when too few partners constrain it.
         """
         s = self.settings
         p_query = query.xyz
@@ -123,9 +141,12 @@ class Refinement:
         H = (weighted @ jacobian).sum(axis=0)
         gradient = np.einsum('nij,nj->ni', weighted, residual)
         cell = np.floor(moved / s.patch).astype(np.int64)
-        _, patch = np.unique(cell, axis=0, return_inverse=True)
-        sums = np.zeros((int(patch.max()) + 1, 6))
-        np.add.at(sums, patch.ravel(), gradient)
+        cell -= cell.min(axis=0)
+        spans = cell.max(axis=0) + 1
+        patch = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+        order = np.argsort(patch, kind='stable')
+        start = np.flatnonzero(np.r_[True, np.diff(patch[order]) > 0])
+        sums = np.add.reduceat(gradient[order], start)
         try:
             H_inverse = np.linalg.inv(H)
         except np.linalg.LinAlgError:

@@ -1,7 +1,8 @@
 """Describe a scan by the heights around the vehicle (Scan Context).
 
 Kim and Kim, "Scan Context: Egocentric Spatial Descriptor for Place Recognition within 3D Point
-Cloud Map", IROS 2018; the thesis's strongest hand-crafted baseline. Equation numbers are the paper's.
+Cloud Map", IROS 2018; the thesis's strongest hand-crafted baseline. Equation numbers are the
+paper's.
 """
 
 import numpy as np

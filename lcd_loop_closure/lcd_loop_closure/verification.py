@@ -127,9 +127,19 @@ class Verification:
         self.settings = settings or VerificationConfig()
         self._origin = np.array([0.0, 0.0, 1.73]) if sensor_origin is None else sensor_origin
 
-    def range_view(self, surface: Surface) -> RangeView:
-        """Return how far this cloud's sensor saw; needed once for each cloud."""
-        return RangeView(surface.xyz, self._origin)
+    def range_view(self, xyz: NDArray[np.floating]) -> RangeView:
+        """Return how far the sensor of a cloud [N x 3] saw; needed once for each cloud."""
+        return RangeView(np.asarray(xyz, np.float64), self._origin)
+
+    def fitness(
+        self, match: Surface, query: Surface, T_match_query: se3.Array, query_ground_z: float
+    ) -> float:
+        """Return the share of the query's structure with a partner in the match, 0..1."""
+        xyz = self._structure(query, query_ground_z)
+        if not len(xyz):
+            return 0.0
+        _, distance = match.nearest(xyz @ T_match_query[:3, :3].T + T_match_query[:3, 3])
+        return float(np.mean(distance < self.settings.partner_distance))
 
     def check(
         self,
@@ -142,9 +152,9 @@ class Verification:
     ) -> Verdict:
         """Judge `T_match_query`; `ground_z` is the ground's height in the match and the query."""
         s = self.settings
-        in_match = query.xyz[query.xyz[:, 2] > ground_z[1] + s.structure_height]
+        in_match = self._structure(query, ground_z[1])
         in_match = in_match @ T_match_query[:3, :3].T + T_match_query[:3, 3]
-        in_query = match.xyz[match.xyz[:, 2] > ground_z[0] + s.structure_height]
+        in_query = self._structure(match, ground_z[0])
         in_query = (in_query - T_match_query[:3, 3]) @ T_match_query[:3, :3]
         if min(len(in_match), len(in_query)) < s.min_structure:
             return Verdict(
@@ -169,6 +179,9 @@ class Verification:
         rmse_m = float(np.sqrt(np.mean(partnered**2))) if len(partnered) else None
         status, reason = self._verdict(T_match_query, ground_z, fitness, overlap, violations)
         return Verdict(fitness, overlap, rmse_m, len(partnered), violations, status, reason)
+
+    def _structure(self, surface: Surface, ground_z: float) -> NDArray[np.float64]:
+        return surface.xyz[surface.xyz[:, 2] > ground_z + self.settings.structure_height]
 
     def _verdict(
         self,
