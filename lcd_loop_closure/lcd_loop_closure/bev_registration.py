@@ -3,8 +3,8 @@
 Vehicles are aligned to gravity, so only yaw, x and y have to be searched, and they can be searched
 exhaustively: every yaw of a grid, every shift by FFT correlation of the bird's-eye views of what
 stands on the ground. Nothing is sampled at random, so the same clouds give the same answer, and a
-reverse pass or a lateral offset is no harder than a same-way one. The result is good to a few decimetres
-and about a degree; GICP (refinement.py) takes it from there.
+reverse pass or a lateral offset is no harder than a same-way one. The result is good to a few
+decimetres and about a degree; GICP (refinement.py) takes it from there.
 """
 
 from dataclasses import dataclass

@@ -2,7 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 
@@ -226,10 +226,13 @@ class LoopDetector:
         s = self.settings.detector
         assert query.descriptor is not None
         wanted = 10 * s.max_candidates  # neighbours of each other, most of them
-        by_descriptor, by_radius = [], []
+        by_descriptor: list[_Candidate] = []
+        by_radius: list[_Candidate] = []
         if s.by_descriptor:
-            for match in self._index.nearest(query.descriptor, self._path_m, wanted):
-                by_descriptor.append(_Candidate(match.id, self.descriptor_method, match.distance))
+            matches = self._index.nearest(query.descriptor, self._path_m, wanted)
+            by_descriptor = [
+                _Candidate(match.id, self.descriptor_method, match.distance) for match in matches
+            ]
         if s.by_radius:
             newest_m = self._path_m - s.delay
             eligible = [
@@ -237,8 +240,8 @@ class LoopDetector:
                 for id, travelled_m in self._travelled_m.items()
                 if travelled_m <= newest_m or id in self._restored
             ]
-            for near in self._radius.nearest(query, self._keyframes, eligible, graph, wanted):
-                by_radius.append(_Candidate(near.id, 'radius'))
+            near = self._radius.nearest(query, self._keyframes, eligible, graph, wanted)
+            by_radius = [_Candidate(keyframe.id, 'radius') for keyframe in near]
         chosen: list[_Candidate] = []
         for pair in zip_longest(by_radius, by_descriptor):
             for candidate in pair:

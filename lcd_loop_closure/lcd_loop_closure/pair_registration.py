@@ -1,0 +1,153 @@
+"""Find out how two keyframes lie to each other, and whether they show the same place at all."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_common.settings import config, setting
+from lcd_loop_closure.bev_registration import BevConfig, BevRegistration, BevView
+from lcd_loop_closure.loop import LoopStatus
+from lcd_loop_closure.refinement import Refinement, RefinementConfig, Surface
+from lcd_loop_closure.verification import RangeView, Verdict, Verification, VerificationConfig
+
+Timer = Callable[[str], AbstractContextManager[object]]
+
+
+@config
+class PairConfig:
+    """Early exits: what they stop would not pass verification, but would cost its time."""
+
+    min_bev_score: float = setting(
+        0.15, 'views from above that correlate less are not refined', low=0.0, high=1.0
+    )
+    near_best: float = setting(
+        0.85, 'answers of the global search are tried down to this share of the best score', low=0.0
+    )
+    min_rough_fitness: float = setting(
+        0.15, 'roughly aligned clouds that fit less are not refined', low=0.0, high=1.0
+    )
+
+
+class PreparedCloud:
+    """What the stages need of one cloud and that depends on it alone, made when first asked for."""
+
+    def __init__(self, xyz: NDArray[np.float32], stages: 'PairRegistration') -> None:
+        self._xyz, self._stages = xyz, stages
+
+    @cached_property
+    def bev(self) -> BevView:
+        """View from above."""
+        return self._stages.registration.view(self._xyz)
+
+    @cached_property
+    def spectra(self) -> NDArray[np.complex64]:
+        """Spectra of the view from above, turned to all yaws (12 MB, of the query alone)."""
+        return self._stages.registration.spectra(self.bev)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Points with their covariances."""
+        return self._stages.refinement.surface(self._xyz)
+
+    @cached_property
+    def range_view(self) -> RangeView:
+        """How far the sensor saw."""
+        return self._stages.verification.range_view(self._xyz)
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """Relative pose of two clouds and the verdict on it; None stands for what was not reached.
+
+    Attributes:
+        status, reason: ACCEPTED or why not, one sentence with value and limit.
+        T_match_query: pose of the query in the match, metres.
+        covariance: 6x6, body axes, translation first; only of accepted pairs.
+        verdict: measures of the verification.
+    """
+
+    status: LoopStatus
+    reason: str
+    T_match_query: se3.Array | None = None
+    covariance: se3.Array | None = None
+    verdict: Verdict | None = None
+
+
+class PairRegistration:
+    """Register from above, refine by GICP, verify; every stage may end it with a reason."""
+
+    method = 'bev+gicp'
+
+    def __init__(
+        self,
+        settings: PairConfig | None = None,
+        registration: BevConfig | None = None,
+        refinement: RefinementConfig | None = None,
+        verification: VerificationConfig | None = None,
+        *,
+        sensor_origin: NDArray[np.float64] | None = None,
+        timer: Timer | None = None,
+    ) -> None:
+        """Build the stages; `timer(stage)` is entered around register, refine and verify."""
+        self.settings = settings or PairConfig()
+        self.registration = BevRegistration(registration)
+        self.refinement = Refinement(refinement)
+        self.verification = Verification(verification, sensor_origin)
+        self._timer = timer or (lambda stage: nullcontext())
+
+    def prepare(self, xyz: NDArray[np.float32]) -> PreparedCloud:
+        """Prepare a reduced cloud [N x 3], base frame; nothing is computed before it is needed."""
+        return PreparedCloud(xyz, self)
+
+    def compare(self, match: PreparedCloud, query: PreparedCloud) -> PairResult:
+        """Find the query's pose in the match and judge it; no initial guess is needed."""
+        s = self.settings
+        rejected = LoopStatus.REJECTED_REGISTRATION
+        with self._timer('register'):
+            hypotheses = self.registration.search(match.bev, query.spectra, query.bev)
+        if not hypotheses:
+            return PairResult(rejected, 'nothing stands on the ground in one of the clouds')
+        score = hypotheses[0].score
+        if score < s.min_bev_score:
+            reason = f'views from above correlate {score:.2f}, below {s.min_bev_score:g}'
+            return PairResult(rejected, reason)
+        with self._timer('refine'):
+            tried = [
+                self._approached(match, query, hypothesis.T_match_query)
+                for hypothesis in hypotheses
+                if hypothesis.score >= s.near_best * score
+            ]
+            fitness, T_match_query = max(tried, key=lambda result: result[0])
+            if fitness < s.min_rough_fitness:
+                reason = f'roughly aligned, fitness {fitness:.2f} is below {s.min_rough_fitness:g}'
+                return PairResult(LoopStatus.REJECTED_FITNESS, reason, T_match_query)
+            refined = self.refinement.refine(match.surface, query.surface, T_match_query)
+        T_match_query = refined.T_match_query
+        with self._timer('verify'):
+            verdict = self.verification.check(
+                match.surface,
+                query.surface,
+                match.range_view,
+                query.range_view,
+                T_match_query,
+                (match.bev.ground_z, query.bev.ground_z),
+            )
+            if verdict.status is not LoopStatus.ACCEPTED:
+                return PairResult(verdict.status, verdict.reason, T_match_query, None, verdict)
+            covariance = self.refinement.covariance(match.surface, query.surface, T_match_query)
+        if covariance is None:
+            reason = 'the clouds do not constrain all six degrees of freedom'
+            return PairResult(rejected, reason, T_match_query, None, verdict)
+        return PairResult(verdict.status, verdict.reason, T_match_query, covariance, verdict)
+
+    def _approached(
+        self, match: PreparedCloud, query: PreparedCloud, T_match_query: se3.Array
+    ) -> tuple[float, se3.Array]:
+        T = self.refinement.approach(match.surface, query.surface, T_match_query)
+        fitness = self.verification.fitness(match.surface, query.surface, T, query.bev.ground_z)
+        return fitness, T
