@@ -52,7 +52,7 @@ def evaluate_drive(result: DriveResult) -> DriveEvaluation:
         before = trajectory_errors(result.odometry, result.truth)
         after = trajectory_errors(corrected, result.truth)
         loops = judge_loops(
-            result.loops, result.keyframes.stamps_ns, result.odometry.stamps_ns, result.truth
+            result.loops, result.keyframes.stamps_ns, result.scan_stamps_ns, result.truth
         )
         if after is not None:
             driven = _between(result.truth, corrected.stamps_ns[0], corrected.stamps_ns[-1])
@@ -95,7 +95,7 @@ def metrics(result: DriveResult, evaluation: DriveEvaluation) -> dict[str, objec
         'drive': {
             'name': result.name,
             'source': result.source,
-            'scans': result.scans,
+            'scans': len(result.scan_stamps_ns),
             'registered': len(result.odometry),
             'keyframes': len(result.keyframes),
             'path_m': evaluation.corrected.length_m,
@@ -152,9 +152,10 @@ def _warnings(result: DriveResult, after: TrajectoryErrors | None) -> list[str]:
             f'Interrupted: only the first {len(result.odometry)} scans were driven; '
             'everything below is about them.'
         )
-    lost = result.scans - len(result.odometry)
+    scans = len(result.scan_stamps_ns)
+    lost = scans - len(result.odometry)
     if lost > 0:
-        texts.append(f'Scans without odometry: {lost} of {result.scans}.')
+        texts.append(f'Scans without odometry: {lost} of {scans}.')
     texts += [f'Not read: {cause} ({count}).' for cause, count in result.skipped.items() if count]
     texts += [
         f'{node.strip("/")}: {cause} ({count}).'

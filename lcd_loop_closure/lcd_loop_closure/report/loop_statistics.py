@@ -12,7 +12,7 @@ import numpy as np
 from lcd_common import se3
 from lcd_common.command_line import run
 from lcd_common.errors import DataError
-from lcd_common.trajectory import read_poses, read_tum
+from lcd_loop_closure.report.reference import read_reference
 from lcd_loop_closure.revisits import RevisitConfig, RevisitStatistics, count_revisits
 
 _DEFAULTS = RevisitConfig()
@@ -34,28 +34,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     arguments = _parser().parse_args(argv)
     return run(lambda: _print_statistics(arguments))
-
-
-def read_any_poses(path: Path) -> se3.Array:
-    """Read poses [N x 4 x 4] from a KITTI file (12 numbers a row, 13 with a time) or TUM's (8).
-
-    Raises:
-        DataError: the file is neither, holds no poses, or a number that is not finite.
-    """
-    try:
-        rows = (
-            line.split('#')[0].replace(',', ' ').split() for line in path.read_text().splitlines()
-        )
-        first = next((row for row in rows if row), None)
-    except UnicodeDecodeError:
-        raise DataError(f'{path}: expected a text file of poses, got something binary') from None
-    if first is None:
-        raise DataError(f'{path}: expected a pose in each row, found none')
-    poses = read_tum(path).T_world_body if len(first) == 8 else read_poses(path)
-    bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
-    if len(bad):
-        raise DataError(f'{path}: the pose in row {bad[0] + 1} is not finite; remove the row')
-    return poses
 
 
 def read_lidar_mounting(path: Path) -> se3.Array:
@@ -85,7 +63,7 @@ def _print_statistics(arguments: argparse.Namespace) -> None:
     T_camera_lidar = None if arguments.calib is None else read_lidar_mounting(arguments.calib)
     counted: list[tuple[Path, RevisitStatistics]] = []
     for path in arguments.poses:
-        poses = read_any_poses(path)
+        poses = read_reference(path).T_world_body
         if T_camera_lidar is not None:
             poses = se3.inverse(T_camera_lidar) @ poses @ T_camera_lidar
         counted.append((path, count_revisits(poses, settings)))

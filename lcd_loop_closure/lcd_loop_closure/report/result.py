@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
@@ -28,7 +29,7 @@ class DriveResult:
         stage_times_ms: node -> stage -> milliseconds of every run of that stage.
         counts: node -> cause -> how often it was counted (rejected inputs, drops).
         skipped: what the reader could not read, by cause.
-        scans: scans that the recording offered.
+        scan_stamps_ns: [N] stamps of every scan that was offered, registered or not.
         recorded_s: time that the driven part of the recording spans.
         wall_s: time that the nodes took for it, reading of the files included.
         interrupted: True when the user stopped it before its end.
@@ -45,7 +46,7 @@ class DriveResult:
     stage_times_ms: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)
     counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     skipped: Mapping[str, int] = field(default_factory=dict)
-    scans: int = 0
+    scan_stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     recorded_s: float = 0.0
     wall_s: float = 0.0
     interrupted: bool = False

@@ -104,7 +104,7 @@ def result(truth: Trajectory, odometry: Trajectory) -> DriveResult:
         },
         counts={'/lidar_odometry': {'rejected: NaN points': 2, 'scans': 800}},
         skipped={'truncated velodyne file': 1},
-        scans=SCANS + 1,
+        scan_stamps_ns=START_NS + PERIOD_NS * np.arange(SCANS + 1),
         recorded_s=79.9,
         wall_s=40.0,
     )

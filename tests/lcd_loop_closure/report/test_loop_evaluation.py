@@ -19,9 +19,7 @@ from lcd_loop_closure.report.result import DriveResult
 
 
 def test_counts_true_false_and_missed(result: DriveResult, truth: Trajectory) -> None:
-    evaluation = judge_loops(
-        result.loops, result.keyframes.stamps_ns, result.odometry.stamps_ns, truth
-    )
+    evaluation = judge_loops(result.loops, result.keyframes.stamps_ns, result.scan_stamps_ns, truth)
     assert evaluation.count(Verdict.TRUE) == 20
     assert evaluation.count(Verdict.FALSE) == 2
     assert evaluation.count(Verdict.REJECTED) == 3

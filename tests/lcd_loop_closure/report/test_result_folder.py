@@ -111,7 +111,7 @@ def test_a_short_drive_without_loops_or_reference_has_a_report(
 ) -> None:
     start = Trajectory(odometry.stamps_ns[:3], odometry.T_world_body[:3])
     first = Trajectory(odometry.stamps_ns[:1], odometry.T_world_body[:1])
-    bare = DriveResult('bare', 'three scans', start, first, scans=3)
+    bare = DriveResult('bare', 'three scans', start, first)
     result_folder.write_result(bare, evaluate_drive(bare), tmp_path / 'bare')
     names = {path.name for path in (tmp_path / 'bare').rglob('*.*')}
     assert 'trajectory.png' in names and 'report.html' in names
