@@ -6,6 +6,7 @@ From then on T_enu_map stays as it is and the fixes act on the keyframes; the gr
 pose the freedom that the alignment's error needs.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
@@ -17,6 +18,9 @@ from lcd_common.settings import config, setting
 
 _A = 6378137.0
 _E2 = 6.69437999014e-3
+# Width of the Cauchy kernel in sigmas: what reflected signals may do.
+_KERNEL = 2.0
+_FEWEST = 5
 
 
 @config
@@ -25,9 +29,6 @@ class GnssConfig:
 
     baseline: float = setting(
         30.0, 'spread of the fixes (root mean square) before they are used', unit='m', low=1.0
-    )
-    kernel: float = setting(
-        2.0, 'width of the Cauchy kernel, in sigmas: what reflections may do', low=0.1
     )
     minimum_sigma: float = setting(
         0.5, 'no fix is believed to be better than this', unit='m', low=1e-3
@@ -81,12 +82,42 @@ class GnssDatum:
         return R_enu_ecef @ (ecef - origin)
 
 
-@dataclass(frozen=True)
-class GnssAlignment:
-    """Where the map lies on the Earth."""
+class GnssTie:
+    """Collect fixes and find where the map lies among them."""
 
-    datum: GnssDatum
-    T_enu_map: se3.Array
+    def __init__(self, settings: GnssConfig) -> None:
+        self.settings = settings
+        self.datum: GnssDatum | None = None
+        self.T_enu_map: se3.Array | None = None
+        self.factors: list[GnssFactor] = []
+
+    def add(self, fix: GnssFix, keyframe_id: int, position_base: se3.Array) -> GnssFactor:
+        """Tie a keyframe to a fix of a point given in its body frame; the first sets the datum.
+
+        Raises:
+            DataError: the fix cannot be used; the text says why.
+        """
+        covariance = usable_covariance(fix, self.settings)
+        where = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+        if self.datum is None:
+            self.datum = GnssDatum(*where)
+        factor = GnssFactor(keyframe_id, self.datum.enu(*where), covariance, position_base)
+        self.factors.append(factor)
+        return factor
+
+    def align(self, T_map_base_of: Callable[[int], se3.Array]) -> bool:
+        """Find T_enu_map from the fixes so far; True when this call found it."""
+        if self.T_enu_map is not None or len(self.factors) < _FEWEST:
+            return False
+        positions_map = np.array(
+            [
+                se3.transform_points(T_map_base_of(f.keyframe_id), f.position_base[None])[0]
+                for f in self.factors
+            ]
+        )
+        positions_enu = np.array([f.position_enu for f in self.factors])
+        self.T_enu_map = align(positions_map, positions_enu, self.settings)
+        return self.T_enu_map is not None
 
 
 def usable_covariance(fix: GnssFix, settings: GnssConfig) -> se3.Array:
@@ -142,15 +173,13 @@ def align(
     return T
 
 
-def gnss_factor(
-    factor: GnssFactor, T_enu_map: se3.Array, key: int, kernel: float
-) -> gtsam.GPSFactorArm:
+def gnss_factor(factor: GnssFactor, T_enu_map: se3.Array, key: int) -> gtsam.GPSFactorArm:
     """Return GTSAM's factor on a keyframe's pose, with the antenna's lever arm and a Cauchy kernel."""
     R_map_enu = T_enu_map[:3, :3].T
     position_map = R_map_enu @ (factor.position_enu - T_enu_map[:3, 3])
     covariance = R_map_enu @ factor.covariance_enu @ R_map_enu.T
     noise = gtsam.noiseModel.Robust.Create(
-        gtsam.noiseModel.mEstimator.Cauchy.Create(kernel),
+        gtsam.noiseModel.mEstimator.Cauchy.Create(_KERNEL),
         gtsam.noiseModel.Gaussian.Covariance(0.5 * (covariance + covariance.T)),
     )
     return gtsam.GPSFactorArm(key, position_map, factor.position_base, noise)

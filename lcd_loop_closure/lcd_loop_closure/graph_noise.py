@@ -44,12 +44,6 @@ class GraphNoiseConfig:
     loop_rotation: float = setting(
         1e-2, 'rotation noise of a loop that gives no covariance', unit='rad', low=1e-9
     )
-    broken_translation: float = setting(
-        30.0, 'translation noise of a link found to be broken', unit='m', low=1.0
-    )
-    broken_rotation: float = setting(
-        3.0, 'rotation noise of a link found to be broken', unit='rad', low=0.1
-    )
 
 
 class GraphNoise:
@@ -81,19 +75,24 @@ class GraphNoise:
             covariance = diagonal(self.settings.loop_translation, self.settings.loop_rotation)
         return covariance + self._loop_floor
 
-    def broken(self) -> se3.Array:
-        """Return the covariance of a link that says next to nothing."""
-        return diagonal(self.settings.broken_translation, self.settings.broken_rotation)
-
 
 def diagonal(translation: float, rotation: float) -> se3.Array:
     """Return a 6x6 covariance of two standard deviations, metres and radians."""
     return np.diag(np.repeat([translation**2, rotation**2], 3))
 
 
+# What an odometry link says that was found to be broken: next to nothing.
+BROKEN_LINK = diagonal(30.0, 3.0)
+
+
 def gaussian(covariance: se3.Array) -> gtsam.noiseModel.Gaussian:
     """Return GTSAM's noise model of a translation-first covariance."""
     return gtsam.noiseModel.Gaussian.Covariance(se3.gtsam_covariance(covariance))
+
+
+def gauge(*, free: bool) -> gtsam.noiseModel.Gaussian:
+    """Return the noise of the first pose: fixed, or free where satellites say where the map lies."""
+    return gaussian(diagonal(10.0, 0.5) if free else diagonal(1e-3, 1e-3))
 
 
 def between(

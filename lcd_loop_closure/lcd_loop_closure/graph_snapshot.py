@@ -28,11 +28,15 @@ LoopKey = tuple[int, int]
 
 @dataclass(frozen=True)
 class GraphLoop:
-    """A loop with its covariance as the graph uses it, and what the graph does with it."""
+    """A loop with its covariance as the graph uses it, and what the graph does with it.
+
+    serial counts the loops of a session as they arrive; one that comes again gets a new one.
+    """
 
     constraint: LoopConstraint
     covariance: se3.Array
     state: LoopState
+    serial: int = 0
 
     @property
     def key(self) -> LoopKey:
@@ -59,6 +63,7 @@ class GraphSnapshot:
         motion_covariances: [N x 6 x 6] as the graph uses them, body axes, translation first.
         broken_links: ids of keyframes whose link to their predecessor was found broken.
         loops: every loop that was offered, in order of arrival.
+        arrivals: how many loops had arrived, repeated ones included.
         gnss: satellite fixes tied to keyframes.
         gnss_datum: origin of the ENU frame; None before the first fix.
         T_enu_map: where the map lies in it; None before it is known, and the fixes do not act.
@@ -72,6 +77,7 @@ class GraphSnapshot:
     motion_covariances: se3.Array
     broken_links: tuple[int, ...] = ()
     loops: tuple[GraphLoop, ...] = ()
+    arrivals: int = 0
     gnss: tuple[GnssFactor, ...] = ()
     gnss_datum: GnssDatum | None = None
     T_enu_map: se3.Array | None = None

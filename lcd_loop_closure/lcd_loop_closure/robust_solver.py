@@ -22,10 +22,9 @@ from lcd_common import se3
 from lcd_common.settings import config, setting
 from lcd_loop_closure import broken_links
 from lcd_loop_closure import pairwise_consistency as pairs
-from lcd_loop_closure.graph_noise import diagonal
 from lcd_loop_closure.graph_snapshot import GraphSnapshot, LoopKey, LoopState
 from lcd_loop_closure.truncated_least_squares import Minimum, TruncatedLeastSquares
-from lcd_loop_closure.weighted_graph import WeightedGraph
+from lcd_loop_closure.weighted_graph import WeightedGraph, Weights
 
 
 @config
@@ -53,12 +52,6 @@ class RobustSolverConfig:
     broken_link_cost: float = setting(
         100.0, 'what giving up a link costs, as a squared distance', low=0.0
     )
-    broken_translation: float = setting(
-        30.0, 'translation noise of a link that was given up', unit='m', low=1.0
-    )
-    broken_rotation: float = setting(
-        3.0, 'rotation noise of a link that was given up', unit='rad', low=0.1
-    )
     weak_translation: float = setting(
         1.0, 'a link with more translation noise is placed by loops first', unit='m', low=0.0
     )
@@ -75,6 +68,7 @@ class Verdict:
         accepted: loops that belong to the graph.
         rejected: loops that do not, each with one sentence for people.
         broken_links: ids of keyframes whose link to their predecessor is wrong.
+        arrivals: the snapshot's; loops that came later are not judged.
         ids, T_map_base: the solved poses [N x 4 x 4] of the snapshot's keyframes.
         iterations: linear solves.
         seconds: wall time.
@@ -83,10 +77,16 @@ class Verdict:
     accepted: frozenset[LoopKey]
     rejected: dict[LoopKey, str]
     broken_links: tuple[int, ...]
+    arrivals: int
     ids: NDArray[np.int64]
     T_map_base: se3.Array
     iterations: int
     seconds: float
+
+    @property
+    def judged_ids(self) -> frozenset[int]:
+        """Ids of the keyframes that the snapshot had."""
+        return frozenset(self.ids.tolist())
 
 
 class RobustSolver:
@@ -113,6 +113,7 @@ class RobustSolver:
             frozenset(loop.key for loop in used if loop.key not in rejected),
             rejected,
             tuple(int(snapshot.ids[row]) for row in judgement.graph.loose_rows),
+            snapshot.arrivals,
             snapshot.ids,
             minimum.poses,
             judgement.graph.iterations,
@@ -126,8 +127,7 @@ class _Judgement:
     def __init__(self, settings: RobustSolverConfig, snapshot: GraphSnapshot) -> None:
         self.settings = settings
         self.snapshot = snapshot
-        broken = diagonal(settings.broken_translation, settings.broken_rotation)
-        self.graph = WeightedGraph(snapshot, broken)
+        self.graph = WeightedGraph(snapshot)
         self.fixed = np.array([loop.state is LoopState.BY_HAND for loop in snapshot.loops], bool)
         threshold = float(chi2.ppf(settings.inlier_probability, 6))
         self.problem = TruncatedLeastSquares(self.graph, threshold, self.fixed)
@@ -210,16 +210,35 @@ class _Judgement:
         groups = self._groups(minimum.poses, out)
         alone = np.setdiff1d(out, np.concatenate(groups) if groups else [])
         candidates = groups + [np.array([k]) for k in alone]
-        # Odometry alone is less sure than the graph: what contradicts even it cannot pay off.
-        lowest = pairs.odometry_distances(self._chain(minimum.poses), self.loops)
-        worth = [g for g in candidates if lowest[g].max() <= len(g) * self.problem.threshold]
-        for group in worth[: self.settings.group_trials]:
+        candidates = self._worth_trying(minimum, candidates)
+        for group in candidates[: self.settings.group_trials]:
             weights = minimum.weights.copy()
             weights[group] = 1.0
             trial = self.problem.settle(weights, minimum.poses)
             if trial.cost < minimum.cost - 1e-3:
                 minimum = trial
         return minimum
+
+    def _worth_trying(
+        self, minimum: Minimum, candidates: list[NDArray[np.int64]]
+    ) -> list[NDArray[np.int64]]:
+        """Drop the groups of which a single loop would already cost more than all of it could save.
+
+        Odometry's chain is less sure than the graph, so what contradicts even it need not be looked
+        at more closely.
+        """
+
+        def saving(distance: Weights) -> list[NDArray[np.int64]]:
+            limit = self.problem.threshold
+            return [g for g in candidates if distance[g].max() <= len(g) * limit]
+
+        self.graph.poses = minimum.poses
+        distance = pairs.odometry_distances(self._chain(minimum.poses), self.loops)
+        candidates = saving(distance)
+        if candidates:
+            looked_at = np.array([group[0] for group in candidates])
+            distance[looked_at] = self.graph.distances(minimum.weights, looked_at)
+        return saving(distance)
 
     def _give_up_link(self, minimum: Minimum) -> Minimum | None:
         """Return a better minimum without one odometry link, or None when there is none."""

@@ -6,11 +6,9 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_loop_closure.gnss import gnss_factor
-from lcd_loop_closure.graph_noise import between, diagonal, gaussian
+from lcd_loop_closure.graph_noise import BROKEN_LINK, between, gauge, gaussian
 from lcd_loop_closure.graph_snapshot import GraphSnapshot
 
-_GAUGE = gaussian(diagonal(1e-3, 1e-3))
-_FREE_GAUGE = gaussian(diagonal(10.0, 0.5))
 _SETTLED = 1e-4
 Weights = NDArray[np.float64]
 
@@ -22,21 +20,18 @@ class WeightedGraph:
     keys of GTSAM are the rows of the snapshot.
     """
 
-    def __init__(
-        self, snapshot: GraphSnapshot, broken_covariance: se3.Array, gnss_kernel: float = 2.0
-    ) -> None:
-        self._broken = gaussian(broken_covariance)
+    def __init__(self, snapshot: GraphSnapshot) -> None:
         self._links = [
             between(row - 1, row, snapshot.motions[row], gaussian(snapshot.motion_covariances[row]))
             for row in range(1, len(snapshot))
         ]
         self._loose_links: dict[int, gtsam.BetweenFactorPose3] = {}
         self._gnss = [
-            gnss_factor(fix, snapshot.T_enu_map, snapshot.row(fix.keyframe_id), gnss_kernel)
+            gnss_factor(fix, snapshot.T_enu_map, snapshot.row(fix.keyframe_id))
             for fix in (snapshot.gnss if snapshot.T_enu_map is not None else ())
         ]
         # Satellite fixes say where the map lies; without any the first pose does.
-        self._gauge = _FREE_GAUGE if self._gnss else _GAUGE
+        self._gauge = gauge(free=bool(self._gnss))
         self.ends = np.array(
             [[snapshot.row(i) for i in loop.key] for loop in snapshot.loops], np.int64
         ).reshape(-1, 2)
@@ -72,7 +67,7 @@ class WeightedGraph:
     def loosen(self, row: int) -> None:
         """Let the link to the previous row say next to nothing."""
         link = self._links[row - 1]
-        self._loose_links[row] = link.cloneWithNewNoiseModel(self._broken)
+        self._loose_links[row] = link.cloneWithNewNoiseModel(gaussian(BROKEN_LINK))
 
     def tighten(self, row: int) -> None:
         """Believe the link to the previous row again."""
@@ -127,9 +122,23 @@ class WeightedGraph:
             if self.step(weights) < tolerance:
                 return
 
-    def marginals(self, weights: Weights) -> gtsam.Marginals:
-        """Return GTSAM's marginals of the weighted graph at the solution."""
-        return gtsam.Marginals(self._graph(weights), self._values)
+    def distances(self, weights: Weights, loops: NDArray[np.int64]) -> Weights:
+        """Return what taking in each of the loops [K] alone would cost, to first order.
+
+        That is its squared Mahalanobis distance from the solution, under its own covariance and the
+        solution's.
+        """
+        marginals = gtsam.Marginals(self._graph(weights), self._values)
+        poses = self.poses
+        out = np.empty(len(loops))
+        for n, k in enumerate(loops):
+            i, j = (int(row) for row in self.ends[k])
+            joint = marginals.jointMarginalCovariance([i, j])
+            relative = relative_covariance(poses[i], poses[j], joint, i, j)
+            T_error = se3.inverse(self._T_match_query[k]) @ se3.inverse(poses[i]) @ poses[j]
+            error = se3.log(T_error)
+            out[n] = error @ np.linalg.solve(relative + self._covariances[k], error)
+        return out
 
     def _anchors(self) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
@@ -167,3 +176,24 @@ def poses_of(values: gtsam.Values) -> se3.Array:
     poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
     poses[:, :3, 3] = rows[:, 9:]
     return poses
+
+
+def relative_covariance(
+    T_map_first: se3.Array,
+    T_map_second: se3.Array,
+    joint: gtsam.JointMarginal,
+    first: int,
+    second: int,
+) -> se3.Array:
+    """Return the 6x6 of T_first_second from the joint marginal of both poses' keys.
+
+    Body axes of the second, translation first.
+    """
+    blocks = [
+        [se3.covariance_from_gtsam(joint.at(a, b)) for b in (first, second)]
+        for a in (first, second)
+    ]
+    T_second_first = se3.inverse(T_map_second) @ T_map_first
+    jacobian = np.hstack([-se3.adjoint(T_second_first), np.eye(6)])
+    covariance: se3.Array = jacobian @ np.block(blocks) @ jacobian.T
+    return 0.5 * (covariance + covariance.T)
