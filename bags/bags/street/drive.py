@@ -59,7 +59,7 @@ class StreetDrive:
     """
 
     camera: CameraModel | None = None
-    mountings = (
+    mountings: tuple[Mounting, ...] = (
         Mounting('base_link', 'lidar', T_BASE_LIDAR),
         Mounting('base_link', 'imu', T_BASE_IMU),
         Mounting('base_link', 'gps', T_BASE_GPS),

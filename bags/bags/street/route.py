@@ -127,6 +127,10 @@ def abrupt_u_turn() -> Route:
     return route.through(back, lane=[-1.75, 1.75, 1.75, 1.75])
 
 
+def _cross(a: Array, b: Array) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
 def _beside(centreline: Array, lanes: Array) -> Array:
     """Shift each stretch to its right and join neighbours where the shifted lines meet."""
     direction = np.diff(centreline, axis=0)
@@ -134,13 +138,13 @@ def _beside(centreline: Array, lanes: Array) -> Array:
     right = np.stack([direction[:, 1], -direction[:, 0]], axis=1) * lanes[:, None]
     points = [centreline[0] + right[0]]
     for i in range(1, len(centreline) - 1):
-        cross = float(np.cross(direction[i - 1], direction[i]))
+        cross = _cross(direction[i - 1], direction[i])
         if abs(cross) < 0.05:  # straight on: change lanes over ten metres
             points.append(centreline[i] + right[i - 1] - 5.0 * direction[i - 1])
             points.append(centreline[i] + right[i] + 5.0 * direction[i])
             continue
         gap = right[i] - right[i - 1]
-        along = float(np.cross(gap, direction[i])) / cross
+        along = _cross(gap, direction[i]) / cross
         points.append(centreline[i] + right[i - 1] + along * direction[i - 1])
     points.append(centreline[-1] + right[-1])
     return np.array(points)
@@ -154,7 +158,7 @@ def _rounded(corners: Array, radius: float) -> Array:
         d_in, d_out = corner - before, after - corner
         l_in, l_out = np.linalg.norm(d_in), np.linalg.norm(d_out)
         d_in, d_out = d_in / l_in, d_out / l_out
-        angle = float(np.arctan2(np.cross(d_in, d_out), d_in @ d_out))
+        angle = float(np.arctan2(_cross(d_in, d_out), d_in @ d_out))
         cut = min(radius * np.tan(abs(angle) / 2), 0.45 * l_in, 0.45 * l_out)
         if abs(angle) < 1e-6:
             continue

@@ -1,0 +1,46 @@
+"""Open what a user names: a bag, a data set folder, or the word `street`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from bags.drives import open_drive
+from bags.records import Drive
+from lcd_common.errors import DataError
+
+
+def open_input(
+    name: str | Path,
+    *,
+    format: str | None = None,
+    sequence: str | None = None,
+    topics: Mapping[str, str] | None = None,
+) -> Drive:
+    """Open a drive as `open_drive` does; `street` and `street:ROUTE` are the analytic town."""
+    word, _, route = str(name).partition(':')
+    if word == 'street' and not Path(name).exists():
+        from bags.street import StreetDrive  # scipy: only for those who drive there
+
+        return StreetDrive(route or 'loop')
+    return open_drive(Path(name), format=format, sequence=sequence, topics=topics)
+
+
+def span_ns(
+    drive: Drive, start_s: float = 0.0, duration_s: float | None = None
+) -> tuple[int, int | None]:
+    """Turn seconds after the drive's first stamp into stamps, both ends inclusive.
+
+    Raises:
+        DataError: the drive is empty, or the start lies behind its end.
+    """
+    streams = [s for s in drive.streams() if s.first_ns is not None and s.last_ns is not None]
+    if not streams:
+        raise DataError(f'{drive.path}: the drive is empty; bags info shows what could be read')
+    first = min(s.first_ns for s in streams if s.first_ns is not None)
+    last = max(s.last_ns for s in streams if s.last_ns is not None)
+    start = first + round(start_s * 1e9)
+    if start > last:
+        raise DataError(
+            f'{drive.path}: the start must lie within its {(last - first) * 1e-9:.1f} s, '
+            f'got {start_s:g} s'
+        )
+    return start, None if duration_s is None else start + round(duration_s * 1e9)
