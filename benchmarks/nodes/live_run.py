@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,13 +33,13 @@ class LiveResult:
 
 
 def run_live(
-    bag: Path, parameters: Sequence[str], log: Path, max_settle_s: float = 120.0
+    bag: Path, parameters: Mapping[str, Sequence[str]], log: Path, max_settle_s: float = 120.0
 ) -> LiveResult:
     """Run the three nodes on a bag.
 
     Args:
         bag: rosbag2 folder or mcap.
-        parameters: `name:=value` for every node, e.g. 'min_range:=3.0'.
+        parameters: node -> `name:=value` strings, e.g. {'lidar_odometry': ['min_range:=3.0']}.
         log: folder for what the processes print.
         max_settle_s: how long the nodes may still work after the last message.
 
@@ -54,7 +54,7 @@ def run_live(
     recorder = LiveRecorder()
     executor = SingleThreadedExecutor()
     executor.add_node(recorder)
-    processes = {name: _start(name, parameters, log) for name in NODES}
+    processes = {name: _start(name, parameters.get(name, ()), log) for name in NODES}
     try:
         _await_nodes(recorder, executor, processes)
         player = _start_player(bag, log)
@@ -80,7 +80,8 @@ def run_live(
 def _start(name: str, parameters: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
     executable = Path(sys.executable).parent / name
     arguments = [str(executable), '--ros-args']
-    for parameter in ('reliable_points:=true', *parameters):
+    reliable = [] if name == 'pose_graph' else ['reliable_points:=true']
+    for parameter in (*reliable, *parameters):
         arguments += ['-p', parameter]
     file = (log / f'{name}.log').open('wb')
     return subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT)

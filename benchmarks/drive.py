@@ -1,0 +1,142 @@
+"""Measure the figures of the SLAM part and write benchmarks/results/drive.json.
+
+    python -m benchmarks.drive                      everything (about an hour on two cores)
+    python -m benchmarks.drive --only u_turn peers  some sections; the others keep their figures
+    python -m benchmarks.drive --list               the sections and what they measure
+
+Exits with 1 when a section failed or a required figure is missing.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import report
+from lcd_common.command_line import run
+from lcd_common.errors import LocalizationError
+
+REQUIRED = (
+    'out_and_back.odometry_lost',
+    'out_and_back.odometry_latency_p50_ms',
+    'out_and_back.odometry_latency_p99_ms',
+    'out_and_back.loops_found_share',
+    'out_and_back.loops_wrong',
+    'out_and_back.end_error_m',
+    'out_and_back.lockstep_realtime_factor',
+    'kitti_00.pair_translation_error_m',
+    'kitti_00.pair_rotation_error_deg',
+    'kitti_00.negatives',
+    'kitti_00.negatives_rejected',
+    'kitti_08.loops',
+    'kitti_08.pairs',
+    'false_loops.worst_ate_ratio',
+    'false_loops.true_kept_share',
+    'false_loops.wrong_accepted',
+    'u_turn.ate_m',
+    'u_turn.kiss_slam_ate_m',
+    'graph_update_p99_ms_at_10000',
+    'memory.bytes_per_keyframe',
+    'peers.kiss_slam.*',
+)
+
+Section = Callable[[Path], dict[str, Any]]
+
+
+def sections() -> dict[str, tuple[str, Section]]:
+    """Return every section by name: what it measures, and the function that does."""
+    # Imported here: --help and --list need none of it.
+    from benchmarks import drives, false_loops, graph_update, loop_pairs, memory, odometry
+
+    return {
+        'kitti_08': ('revisits of the thesis counted on KITTI 08', loop_pairs.count_kitti_08),
+        'kitti_00': ('one true and many false pairs of real scans', loop_pairs.evaluate),
+        'odometry': ('consistency of the odometry covariance in simulation', odometry.evaluate),
+        'false_loops': ('wrong loops added to known graphs', false_loops.evaluate),
+        'graph_update': ('one update among 10,000 keyframes', graph_update.evaluate),
+        'out_and_back': ('real sweeps at 1x through DDS', drives.out_and_back_live),
+        'lockstep': ('the same sweeps in lock-step', drives.out_and_back_lockstep),
+        'u_turn': ('a turn that breaks odometry, beside KISS-SLAM', drives.u_turn),
+        'peers': ('the same folders through KISS-SLAM', drives.side_by_side),
+        'memory': ('an hour of replay', memory.evaluate),
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks.drive',
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--only', nargs='+', metavar='SECTION', help='measure only these')
+    parser.add_argument('--list', action='store_true', help='list the sections and stop')
+    parser.add_argument('--work', type=Path, help='folder for intermediate files, kept')
+    arguments = parser.parse_args(argv)
+    return run(lambda: _run(arguments))
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    known = sections()
+    if arguments.list:
+        for name, (text, _) in known.items():
+            print(f'{name:<14}{text}')
+        return 0
+    unknown = sorted(set(arguments.only or ()) - set(known))
+    if unknown:
+        raise LocalizationError(f'no section {", ".join(unknown)}; there are {", ".join(known)}')
+    chosen = [name for name in known if not arguments.only or name in arguments.only]
+    with tempfile.TemporaryDirectory(prefix='drive_benchmark_') as temporary:
+        work = arguments.work or Path(temporary)
+        work.mkdir(parents=True, exist_ok=True)
+        failures = measure({name: known[name][1] for name in chosen}, work)
+    figures = report.read('drive')
+    report.print_table(figures)
+    absent = report.missing(figures, REQUIRED)
+    for name, error in failures.items():
+        print(f'could not run {name}: {error}', file=sys.stderr)
+    if absent:
+        print(f'missing figures: {", ".join(absent)}', file=sys.stderr)
+    return 1 if failures or absent else 0
+
+
+def measure(chosen: dict[str, Section], work: Path) -> dict[str, str]:
+    """Run sections one by one, keeping each one's figures at once; return what failed, and why."""
+    failures = {}
+    for number, (name, section) in enumerate(chosen.items(), start=1):
+        print(f'[{number}/{len(chosen)}] {name} ...', file=sys.stderr, flush=True)
+        start = time.perf_counter()
+        try:
+            new = section(work)
+        except (LocalizationError, OSError, AssertionError, RuntimeError, ImportError) as error:
+            failures[name] = f'{type(error).__name__}: {error}'
+            continue
+        seconds = time.perf_counter() - start
+        figures = _placed(report.read('drive'), name, new)
+        measured = {**report.provenance(), 'seconds': round(seconds, 1)}
+        figures['measured'] = {**figures.get('measured', {}), name: measured}
+        report.write('drive', figures)
+    return failures
+
+
+def _placed(figures: dict[str, Any], section: str, new: dict[str, Any]) -> dict[str, Any]:
+    """Put a section's figures where the result tables expect them."""
+    figures = dict(figures)
+    if section == 'lockstep':
+        figures['out_and_back'] = {**figures.get('out_and_back', {}), **new}
+    elif section == 'out_and_back':
+        kept = {k: v for k, v in figures.get(section, {}).items() if k.startswith('lockstep')}
+        figures[section] = {**new, **kept}
+    elif section == 'graph_update':
+        figures['graph_update'] = new
+        figures['graph_update_p99_ms_at_10000'] = new['p99_ms']
+    else:
+        figures[section] = new
+    return figures
+
+
+if __name__ == '__main__':
+    sys.exit(main())
