@@ -218,9 +218,11 @@ def draw_map(
     Returns:
         The image, for a colour bar.
     """
-    xyz = cloud.xyz
-    left, bottom = xyz[:, :2].min(axis=0)
-    width, height = np.maximum(np.ptp(xyz[:, :2], axis=0), 1.0)
+    # A handful of far points would shrink everything else.
+    corners = np.percentile(cloud.xyz[:, :2], [0.1, 99.9], axis=0)
+    xyz = cloud.xyz[((cloud.xyz[:, :2] >= corners[0]) & (cloud.xyz[:, :2] <= corners[1])).all(1)]
+    left, bottom = corners[0]
+    width, height = np.maximum(corners[1] - corners[0], 1.0)
     cell = max(width, height) / pixels
     rows, columns = int(height / cell) + 1, int(width / cell) + 1
     pixel = ((xyz[:, 1] - bottom) / cell).astype(np.int64) * columns + (
