@@ -1,7 +1,7 @@
 """Read a rosbag1 or rosbag2 recording with the standard messages."""
 
 import heapq
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from lcd_common.trajectory import Trajectory
 # Messages are recorded in order of arrival: a slow camera's come later than its stamps say.
 _REORDER_NS = 2_000_000_000
 _MARGIN_NS = 10_000_000_000
+_TAILS_NS = (1_000_000_000, 10_000_000_000, None)
 
 
 def is_rosbag(path: Path) -> bool:
@@ -187,22 +188,20 @@ class RosbagDrive:
 
     def _first_and_last(self) -> dict[str, tuple[BagMessage, BagMessage]]:
         if self._ends is None:
-            self._ends = {}
-            for role, topic in self._chosen.items():
-                ends = self._ends_of(topic.name)
-                if ends is not None:
-                    self._ends[role] = ends
+            topics = list(self._roles)
+            first = {t: next(self._source.messages([t]), None) for t in topics}
+            last: dict[str, BagMessage] = {}
+            for tail_ns in _TAILS_NS:  # most topics last until the end; look further for others
+                left = [t for t in topics if t not in last and first[t] is not None]
+                start_ns = None if tail_ns is None else self._source.last_log_ns - tail_ns
+                for found in self._source.messages(left, start_ns) if left else ():
+                    last[found.topic] = _without_data(found)
+            self._ends = {
+                self._roles[topic]: (_without_data(found), last[topic])
+                for topic, found in first.items()
+                if found is not None and topic in last
+            }
         return self._ends
-
-    def _ends_of(self, topic: str) -> tuple[BagMessage, BagMessage] | None:
-        first = next(self._source.messages([topic]), None)
-        if first is None:
-            return None
-        tail = self._source.messages([topic], self._source.last_log_ns - _MARGIN_NS)
-        last = _last_of(tail)
-        if last is None:  # it ends long before the bag does
-            last = _last_of(self._source.messages([topic])) or first
-        return _without_data(first), _without_data(last)
 
     def _read_camera(self) -> CameraModel | None:
         if self._camera_info is None:
@@ -233,11 +232,6 @@ def _stamp_or_none(found: BagMessage) -> int | None:
         return stamp_of(found.message)
     except UnreadableError:
         return None
-
-
-def _last_of(messages: Iterator[BagMessage]) -> BagMessage | None:
-    last = deque(messages, maxlen=1)
-    return last[0] if last else None
 
 
 class _Header:

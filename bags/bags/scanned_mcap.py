@@ -6,24 +6,34 @@ end. Everything before the cut is intact, and most of the half chunk can be unpa
 
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import lz4.frame
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import breakup_chunk
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.stores import Stores
 
 from bags.skips import Skips
 from lcd_common.errors import DataError
 
-_MESSAGE = 0x05
+_MAGIC = b'\x89MCAP0\r\n'
+_READ: dict[int, Callable[[ReadDataStream, int], McapRecord]] = {
+    Opcode.SCHEMA: lambda stream, length: Schema.read(stream),
+    Opcode.CHANNEL: lambda stream, length: Channel.read(stream),
+    Opcode.MESSAGE: Message.read,
+    Opcode.CHUNK: lambda stream, length: Chunk.read(stream),
+}
+# A longer one that runs past the end of the file is not cut off: its length is damaged.
+_LARGEST_CHUNK = 2**30
 _RECORD_HEADER = struct.Struct('<BQ')
-_MESSAGE_HEADER = struct.Struct('<HIQQ')
 
 
 class ScannedMcap:
@@ -99,26 +109,56 @@ class ScannedMcap:
             yield from sorted(messages, key=lambda m: m.log_time)
 
     def _records(self) -> Iterator[McapRecord]:
+        """Yield the records outside of chunks and the chunks; the last chunk may lack its end."""
+        size = self.path.stat().st_size
         with self.path.open('rb') as file:
-            try:
-                yield from StreamReader(file, emit_chunks=True).records
-            except (McapError, struct.error, ValueError, UnicodeDecodeError, MemoryError):
-                self._skips.add(
-                    'bag cut off: the rest of the file',
-                    self.path,
-                    f'{self.path}: cut off or damaged at byte {file.tell()} of '
-                    f'{self.path.stat().st_size}; what comes before is read',
-                )
+            at = len(_MAGIC) if file.read(len(_MAGIC)) == _MAGIC else size
+            while at + _RECORD_HEADER.size <= size:
+                opcode, length = _RECORD_HEADER.unpack(file.read(_RECORD_HEADER.size))
+                at += _RECORD_HEADER.size + length
+                if opcode == Opcode.DATA_END:
+                    return
+                whole = at <= size
+                cut_chunk = opcode == Opcode.CHUNK and length < _LARGEST_CHUNK
+                if opcode in _READ and (whole or cut_chunk):
+                    payload = file.read(length)
+                    try:
+                        yield _READ[opcode](ReadDataStream(BytesIO(payload)), len(payload))
+                    except (McapError, struct.error, ValueError):
+                        break
+                file.seek(min(at, size))
+        self._skips.add(
+            'bag cut off: the rest of the file',
+            self.path,
+            f'{self.path}: cut off or damaged at byte {min(at, size)}; what comes before is read',
+        )
 
     def _unpack(self, chunk: Chunk) -> list[McapRecord]:
+        """Return a chunk's records; of one that is cut off, those that are whole."""
         try:
-            return breakup_chunk(chunk, validate_crc=True)
-        except CRCValidationError:
-            lost = f'{self.path}: the chunk from {chunk.message_start_time} fails its checksum'
-            self._skips.add('damaged chunk of a bag', (self.path, chunk.message_start_time), lost)
+            data = _decompressed(chunk)
+            if len(data) < chunk.uncompressed_size:
+                data, crc = _whole_records(data), 0
+            else:
+                crc = chunk.uncompressed_crc
+            return breakup_chunk(
+                Chunk(
+                    compression='',
+                    data=data,
+                    message_start_time=chunk.message_start_time,
+                    message_end_time=chunk.message_end_time,
+                    uncompressed_crc=crc,
+                    uncompressed_size=len(data),
+                ),
+                validate_crc=True,
+            )
+        except (zstandard.ZstdError, RuntimeError, McapError, ValueError, struct.error) as error:
+            self._skips.add(
+                'damaged chunk of a bag',
+                (self.path, chunk.message_start_time),
+                f'{self.path}: the chunk from {chunk.message_start_time} is damaged: {error}',
+            )
             return []
-        except Exception:  # noqa: BLE001 - zstd, lz4: an exception each
-            return _unpack_beginning(chunk)
 
     def _type_name(self, channel: Channel) -> str:
         schema = self._schemas.get(channel.schema_id)
@@ -136,26 +176,21 @@ class ScannedMcap:
         return name
 
 
-def _unpack_beginning(chunk: Chunk) -> list[McapRecord]:
-    """Return the whole messages at the beginning of a chunk that is cut off."""
-    data = chunk.data
-    try:
-        if chunk.compression == 'zstd':
-            data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
-        elif chunk.compression == 'lz4':
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data)
-    except (zstandard.ZstdError, RuntimeError):
-        return []
-    records: list[McapRecord] = []
-    position = 0
-    while position + _RECORD_HEADER.size <= len(data):
-        opcode, length = _RECORD_HEADER.unpack_from(data, position)
-        position += _RECORD_HEADER.size
-        if position + length > len(data):
+def _decompressed(chunk: Chunk) -> bytes:
+    """Return what a chunk holds, or its beginning when its end is missing."""
+    if chunk.compression == 'zstd':
+        return zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
+    if chunk.compression == 'lz4':
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data))
+    return chunk.data
+
+
+def _whole_records(data: bytes) -> bytes:
+    """Return the beginning of a chunk up to the last record that is whole."""
+    end = 0
+    while end + _RECORD_HEADER.size <= len(data):
+        _, length = _RECORD_HEADER.unpack_from(data, end)
+        if end + _RECORD_HEADER.size + length > len(data):
             break
-        if opcode == _MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE_HEADER.unpack_from(data, position)
-            body = data[position + _MESSAGE_HEADER.size : position + length]
-            records.append(Message(channel, log_time, body, publish_time, sequence))
-        position += length
-    return records
+        end += _RECORD_HEADER.size + length
+    return data[:end]
