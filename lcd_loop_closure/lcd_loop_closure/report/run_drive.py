@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         help='topic of a bag to read as points, imu, …; empty: none (repeatable)')  # fmt: skip
     add('--params', type=Path, action='append', default=[], metavar='YAML',
         help='ROS parameter file for the nodes (repeatable)')  # fmt: skip
-    add('--threads', type=_count, default=0, metavar='N',
+    add('--threads', type=_count, metavar='N',
         help='threads of registration; 1 repeats exactly, 0: all cores (default)')  # fmt: skip
     add('--start', type=_seconds, default=0.0, metavar='S', help='leave out the first S seconds')
     add('--duration', type=_seconds, metavar='S', help='drive S seconds only')
