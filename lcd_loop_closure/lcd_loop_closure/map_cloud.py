@@ -1,6 +1,6 @@
 """Assemble the map cloud from keyframe clouds, touching only what changed."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,10 @@ class MapCloudConfig:
 class MapCloud:
     """Hold the voxelised map in square tiles.
 
-    A new keyframe adds points where voxels are empty. A keyframe that moved by more than half a voxel
-    (measured at `range`) has the tiles it lies in and lay in rebuilt. In each voxel the point of the
-    keyframe with the smallest id is kept, so the result does not depend on how the updates were cut.
-    Within that tolerance, that is: a keyframe that moved less stays where it was.
+    A new keyframe adds points where voxels are empty. A keyframe that moved by more than half a
+    voxel (measured at `range`) has the tiles it lies in and lay in rebuilt; one that moved less
+    stays where it was. In each voxel the point of the keyframe with the smallest id is kept, so
+    the result does not depend on how the updates were cut.
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class MapCloud:
         self._keyframes_of: dict[Tile, set[int]] = {}
         self._tiles_of: dict[int, list[Tile]] = {}
 
-    def update(self, T_map_base: se3.Array) -> int:
+    def update(self, T_map_base: Mapping[int, se3.Array]) -> int:
         """Bring the map to the given poses.
 
         Args:
-            T_map_base: pose [4 x 4] of every keyframe; its index is the keyframe's id.
+            T_map_base: pose [4 x 4] of every keyframe by id.
 
         Returns:
             How many keyframes were looked at: 0 when nothing changed.
         """
         moved = [id_ for id_ in self._T_map_base if self._moved(id_, T_map_base[id_])]
-        new = [id_ for id_ in range(len(T_map_base)) if id_ not in self._T_map_base]
+        new = [id_ for id_ in T_map_base if id_ not in self._T_map_base]
         stale: set[Tile] = set()
         for id_ in moved:
             stale.update(self._forget(id_))

@@ -22,6 +22,10 @@ def _drive(count: int, bend: float = 0.0) -> np.ndarray:
     return np.array(poses)
 
 
+def _by_id(T_map_base: np.ndarray) -> dict[int, np.ndarray]:
+    return dict(enumerate(T_map_base))
+
+
 def _brute_force(clouds: dict[int, np.ndarray], T_map_base: np.ndarray) -> set[tuple[float, ...]]:
     voxels: dict[tuple[int, ...], tuple[float, ...]] = {}
     for id_, T in enumerate(T_map_base):
@@ -51,20 +55,20 @@ def test_built_at_once_and_one_by_one_it_is_the_brute_force_map() -> None:
     clouds, poses = _clouds(12), _drive(12)
     expected = _brute_force(clouds, poses)
     at_once = MapCloud(SETTINGS, clouds.__getitem__)
-    assert at_once.update(poses) == 12
+    assert at_once.update(_by_id(poses)) == 12
     _same(_points(at_once), expected)
     grown = MapCloud(SETTINGS, clouds.__getitem__)
     for count in range(1, 13):
-        assert grown.update(poses[:count]) == 1
+        assert grown.update(_by_id(poses[:count])) == 1
     np.testing.assert_array_equal(grown.points(), at_once.points())
 
 
 def test_after_a_loop_bends_the_path_it_is_the_map_of_the_new_path() -> None:
     clouds = _clouds(12)
     cloud = MapCloud(SETTINGS, clouds.__getitem__)
-    cloud.update(_drive(12))
+    cloud.update(_by_id(_drive(12)))
     bent = _drive(12, bend=0.05)
-    cloud.update(bent)
+    cloud.update(_by_id(bent))
     # The first poses move less than the tolerance and stay where they were included.
     tolerance = SETTINGS.voxel / 2
     included = _drive(12)
@@ -88,12 +92,12 @@ def test_only_what_changed_is_looked_at() -> None:
     poses = np.tile(np.eye(4), (50, 1, 1))
     poses[:, 0, 3] = 100.0 * np.arange(50)
     cloud = MapCloud(SETTINGS, points_of)
-    cloud.update(poses)
+    cloud.update(_by_id(poses))
     asked.clear()
-    assert cloud.update(poses) == 0
+    assert cloud.update(_by_id(poses)) == 0
     assert asked == []
     poses[20, 1, 3] += 3.0
-    assert cloud.update(poses) == 1
+    assert cloud.update(_by_id(poses)) == 1
     assert set(asked) == {20}
     _same(_points(cloud), _brute_force(clouds, poses))
 
@@ -101,7 +105,7 @@ def test_only_what_changed_is_looked_at() -> None:
 def test_without_keyframes_or_points_the_map_is_empty() -> None:
     cloud = MapCloud(SETTINGS, lambda _: np.empty((0, 3), np.float32))
     assert cloud.points().shape == (0, 3)
-    cloud.update(_drive(3))
+    cloud.update(_by_id(_drive(3)))
     assert cloud.points().shape == (0, 3)
 
 
@@ -115,5 +119,5 @@ def test_random_updates_never_differ_from_the_brute_force_map(seed: int) -> None
         count = min(10, count + int(random.integers(0, 3)))
         for k in random.integers(0, count, 2):
             poses[k] = poses[k] @ se3.exp([*random.uniform(1, 30, 3), 0, 0, random.uniform(1, 3)])
-        cloud.update(poses[:count])
+        cloud.update(_by_id(poses[:count]))
         _same(_points(cloud), _brute_force(clouds, poses[:count]))

@@ -1,8 +1,8 @@
 """Write a nav_msgs/Path as its serialized bytes.
 
 The whole path is published whenever a loop bends it. Building 10,000 PoseStamped objects in Python
-takes a quarter of a second; all poses share one frame_id, so their bytes have a fixed stride and one
-numpy array holds them. `publisher.publish` takes serialized bytes as it takes messages.
+takes a quarter of a second; all poses share one frame_id, so their bytes have a fixed stride and
+one numpy array holds them. `publisher.publish` takes serialized bytes as it takes messages.
 """
 
 import numpy as np
@@ -42,8 +42,8 @@ def path_bytes(
             'itemsize': pose_header + padding + _POSE,
         }
     )
-    # Every pose but the first starts behind a double, at a multiple of 8. The first starts behind the
-    # count; it is laid down as the others are, and its header then moved to where it belongs.
+    # Every pose but the first starts behind a double, at a multiple of 8. The first starts behind
+    # the count; it is laid down as the others are, and its header then moved to where it belongs.
     first_doubles = len(prefix) + pose_header
     first_doubles += -first_doubles % 8
     start = first_doubles - pose_header - padding

@@ -1,0 +1,82 @@
+"""Have the loops of a live graph judged beside it."""
+
+from collections.abc import Callable
+
+from rclpy.node import Node
+
+from lcd_common.nodes.worker import Worker
+from lcd_loop_closure.graph_snapshot import GraphSnapshot
+from lcd_loop_closure.robust_solver import RobustSolver, RobustSolverConfig, Verdict
+from lcd_loop_closure.verdict_process import VerdictProcess
+
+
+class GraphJudge:
+    """Solve snapshots one at a time and hand each verdict back on the node's own executor.
+
+    Threaded, the solve runs in a process of its own, and a verdict that is ready wakes the
+    executor. Otherwise `judge` returns when the verdict is handed back.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: RobustSolverConfig,
+        *,
+        threaded: bool,
+        niceness: int,
+        on_verdict: Callable[[object, Verdict], None],
+        on_error: Callable[[Exception], None],
+    ) -> None:
+        """Make a judge.
+
+        Args:
+            node: whose executor calls `on_verdict`.
+            settings: of the solver.
+            threaded: False solves inside `judge`.
+            niceness: of the solver's process.
+            on_verdict: called with the token given to `judge`, and the verdict.
+            on_error: called on the worker's thread when a solve fails.
+        """
+        self._threaded, self._on_verdict, self._stopping = threaded, on_verdict, False
+        self._process = VerdictProcess(settings, niceness) if threaded else None
+        solver = self._process or RobustSolver(settings)
+        self._solve = solver.solve
+        self._ready: list[tuple[object, Verdict]] = []
+        self._wake = node.create_guard_condition(self.hand_over)
+        self._worker: Worker[tuple[object, GraphSnapshot]] = Worker(
+            self._work,
+            capacity=1,
+            threaded=threaded,
+            on_drop=lambda item: None,
+            on_error=lambda error: None if self._stopping else on_error(error),
+            name=f'{node.get_name()} judge',
+        )
+
+    @property
+    def busy(self) -> bool:
+        """True while a snapshot is being solved or its verdict waits to be handed over."""
+        return not self._worker.idle() or bool(self._ready)
+
+    def judge(self, token: object, snapshot: GraphSnapshot) -> None:
+        """Solve a snapshot; `token` comes back with the verdict, to tell an old graph's."""
+        self._worker.put((token, snapshot))
+
+    def hand_over(self) -> None:
+        """Hand over the verdicts that are ready, on the caller's thread."""
+        while self._ready:
+            self._on_verdict(*self._ready.pop(0))
+
+    def stop(self) -> None:
+        """End the worker and the solver's process."""
+        self._stopping = True
+        if self._process is not None:
+            self._process.close()
+        self._worker.stop()
+
+    def _work(self, item: tuple[object, GraphSnapshot]) -> None:
+        token, snapshot = item
+        self._ready.append((token, self._solve(snapshot)))
+        if self._threaded:
+            self._wake.trigger()
+        else:
+            self.hand_over()

@@ -1,0 +1,436 @@
+"""Correct odometry by loops, and keep the map.
+
+    ros2 run lcd_loop_closure pose_graph --ros-args --params-file config/pose_graph.yaml
+
+Subscribes  keyframe (lcd_msgs/Keyframe), loop_constraint (lcd_msgs/LoopConstraint), odom
+            (nav_msgs/Odometry), /tf_static, gps/fix (sensor_msgs/NavSatFix, with use_gps),
+            initialpose (geometry_msgs/PoseWithCovarianceStamped: where a session starts in a
+            loaded map)
+Publishes   /tf map -> odom (with publish_tf), pose (geometry_msgs/PoseWithCovarianceStamped, at
+            odometry's rate), path (nav_msgs/Path), graph/keyframes (sensor_msgs/PointCloud2: x y z
+            id), loops (lcd_msgs/LoopConstraintArray: every loop with the latest verdict),
+            loop_markers (visualization_msgs/MarkerArray: accepted green, rejected red), map
+            (sensor_msgs/PointCloud2, only while somebody listens), /diagnostics
+Services    ~/save_map (lcd_msgs/SaveMap), ~/load_map (lcd_msgs/LoadMap), ~/pause
+            (std_srvs/SetBool), ~/reset (std_srvs/Trigger), ~/add_loop (lcd_msgs/AddLoop),
+            ~/remove_loop (lcd_msgs/RemoveLoop)
+
+A loop acts at once if it agrees with the estimate; all loops are judged together beside the
+callbacks, and the verdict takes loops out of the graph or puts them back. Parameters: see
+config/pose_graph.yaml or `ros2 param describe`.
+"""
+
+import math
+import time
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import NavSatFix, PointCloud2
+
+from lcd_common import se3
+from lcd_common.errors import DataError
+from lcd_common.nodes import messages, qos
+from lcd_common.nodes.diagnostics import Diagnostics
+from lcd_common.nodes.parameters import declare_config
+from lcd_common.nodes.spin import run_node
+from lcd_common.nodes.transforms import StaticTransforms, TransformAuthority
+from lcd_common.settings import config, setting
+from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
+from lcd_loop_closure.corrected_pose import CorrectedPose
+from lcd_loop_closure.gnss import GnssFix
+from lcd_loop_closure.graph_noise import GraphNoise
+from lcd_loop_closure.graph_settings import GraphSettings
+from lcd_loop_closure.keyframes import Keyframe
+from lcd_loop_closure.map_cloud import MapCloudConfig
+from lcd_loop_closure.map_store import load_map
+from lcd_loop_closure.nodes.conversions import keyframe_from_message, loop_from_message
+from lcd_loop_closure.nodes.fix_message import fix_from_message
+from lcd_loop_closure.nodes.graph_display import GraphDisplay, Shown
+from lcd_loop_closure.nodes.graph_judge import GraphJudge
+from lcd_loop_closure.nodes.group_parameters import declare_groups
+from lcd_loop_closure.nodes.map_services import MapServices
+from lcd_loop_closure.nodes.odometry_message import odometry_pose
+from lcd_loop_closure.nodes.path_message import path_bytes
+from lcd_loop_closure.nodes.positions_message import positions_message
+from lcd_loop_closure.nodes.stream_watch import StreamWatch
+from lcd_loop_closure.online_map import OnlineMap, OnlineMapConfig
+from lcd_loop_closure.robust_solver import RobustSolverConfig, Verdict
+from lcd_loop_closure.session_anchor import AnchorConfig
+from lcd_msgs.msg import Keyframe as KeyframeMessage
+from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
+
+
+@config
+class PoseGraphNodeConfig:
+    """How the node runs; the settings of the graph and its parts are in groups beside these."""
+
+    map: str = setting('', 'folder of a saved map to go on in from the start; empty: a new map')
+    map_frame: str = setting('map', 'frame of the corrected poses')
+    odom_frame: str = setting('odom', 'frame of odometry')
+    publish_tf: bool = setting(True, 'own map -> odom; false when something else does')
+    use_gps: bool = setting(False, 'tie keyframes to the satellite fixes of gps/fix')
+    max_odometry_gap: float = setting(
+        0.3, 'longest time between two odometry messages to interpolate over', unit='s', low=0.0
+    )
+    display_period: float = setting(
+        1.0, 'shortest time between two loops, loop_markers', unit='s', low=0.0
+    )
+    map_period: float = setting(5.0, 'shortest time between two map clouds', unit='s', low=0.0)
+    on_time_jump: str = setting(
+        'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
+    )
+    solver_niceness: int = setting(
+        5, 'lower priority of the process that judges the loops', low=0, high=19
+    )
+    threaded: bool = setting(True, 'work beside the callbacks; false: inside, for lock-step replay')
+
+
+class PoseGraphNode(Node):
+    """See the module's documentation."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('pose_graph', **node_options)
+        self.config = declare_config(self, PoseGraphNodeConfig)
+        threaded = self.config.threaded
+        graph = declare_groups(self, GraphSettings())
+        self.diagnostics = Diagnostics(self)
+        self.map = OnlineMap(
+            declare_config(self, OnlineMapConfig, 'online_map'),
+            graph,
+            declare_config(self, AnchorConfig, 'anchor'),
+            self.diagnostics.count,
+        )
+        self._noise = GraphNoise(graph.noise)
+        self._transforms = StaticTransforms(self)
+        self._authority = (
+            TransformAuthority(self, self.config.map_frame, self.config.odom_frame)
+            if self.config.publish_tf
+            else None
+        )
+        self._judge = GraphJudge(
+            self,
+            declare_config(self, RobustSolverConfig, 'solver'),
+            threaded=threaded,
+            niceness=self.config.solver_niceness,
+            on_verdict=self._on_verdict,
+            on_error=lambda error: self._reject('verdicts', 'solver failed', str(error)),
+        )
+        self._display = GraphDisplay(
+            self,
+            self.diagnostics,
+            declare_config(self, MapCloudConfig, 'map_cloud'),
+            self.config.map_frame,
+            threaded=threaded,
+        )
+        gap_ns = round(self.config.max_odometry_gap * 1e9)
+        self._keyframe_poses: StampBuffer[int] = StampBuffer(100, gap_ns)
+        self._fixes: StampBuffer[tuple[GnssFix, se3.Array]] = StampBuffer(100, gap_ns)
+        self._watch_odom = StreamWatch(
+            self, self.diagnostics, 'odom', self.config.on_time_jump, self._forget_odometry
+        )
+        self.paused = False
+        self.base_frame = 'base_link'
+        self._odometry: StampedPose | None = None
+        self._newest: tuple[int, StampedPose] | None = None  # odometry at the newest keyframe
+        self._corrected: CorrectedPose | None = None
+        self._asked: tuple[object, int] | None = None
+        self._rivals = 0
+        self._shown_s = self._mapped_s = -math.inf
+        self._undrawn = self._unmapped = False
+
+        self._path_out = self.create_publisher(Path, 'path', qos.LATCHED)
+        self._positions_out = self.create_publisher(PointCloud2, 'graph/keyframes', qos.LATCHED)
+        self._pose_out = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.RELIABLE)
+        self.create_subscription(KeyframeMessage, 'keyframe', self.on_keyframe, qos.RELIABLE)
+        self.create_subscription(
+            LoopConstraintMessage, 'loop_constraint', self.on_loop_constraint, qos.RELIABLE
+        )
+        self.create_subscription(Odometry, 'odom', self.on_odom, qos.RELIABLE)
+        self.create_subscription(
+            PoseWithCovarianceStamped, 'initialpose', self.on_initialpose, qos.RELIABLE
+        )
+        if self.config.use_gps:
+            self.create_subscription(NavSatFix, 'gps/fix', self.on_gps_fix, qos.SENSOR)
+        self._services = MapServices(self, threaded=threaded)
+        # Steady: also while simulated time stands still somebody may want to see the map. Lock-step
+        # fires what runs by its own clock.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self.refresh, clock=steady if threaded else None)
+        self.diagnostics.watch('keyframes in the map', lambda: len(self.map))
+        self.diagnostics.watch('map memory [MB]', lambda: f'{self.map.nbytes * 1e-6:.1f}')
+        self._map_path = ''
+        if self.config.map:
+            self.restart(self.config.map)
+
+    def on_keyframe(self, message: KeyframeMessage) -> None:
+        """Append a keyframe to the map."""
+        try:
+            keyframe = keyframe_from_message(message)
+        except DataError as error:
+            self._reject('keyframe', 'broken', str(error))
+            return
+        if self.paused:
+            self.diagnostics.count('ignored keyframes: paused')
+            return
+        if not self._same_session(keyframe):
+            return
+        self.diagnostics.tick('keyframe', keyframe.stamp_ns)
+        self.base_frame = message.child_frame_id or self.base_frame
+        try:
+            self.map.add_keyframe(keyframe)
+        except DataError as error:
+            self._reject('keyframe', 'out of order', str(error))
+            return
+        self._note(self._keyframe_poses.add_item(keyframe.stamp_ns, keyframe.id))
+        self.update()
+
+    def on_loop_constraint(self, message: LoopConstraintMessage) -> None:
+        """Offer a loop to the graph."""
+        if self.paused:
+            self.diagnostics.count('ignored loops: paused')
+            return
+        try:
+            taken = self.map.add_loop(loop_from_message(message))
+        except (DataError, ValueError) as error:
+            self._reject('loop_constraint', 'broken', str(error))
+            return
+        self.diagnostics.count(f'loops {taken}')
+        if taken == 'in':
+            self.update()
+        self._show()
+
+    def on_odom(self, message: Odometry) -> None:
+        """Correct odometry: broadcast map -> odom and publish the pose."""
+        try:
+            pose = odometry_pose(message)
+        except DataError as error:
+            self._reject('odom', 'broken', str(error))
+            return
+        frame, expected = message.header.frame_id, self.config.odom_frame
+        problem = None if frame == expected else f'odom is in {frame}, expected {expected}'
+        self.diagnostics.error('odom_frame', problem and f'{problem}: set odom_frame')
+        if problem is not None:
+            self._reject('odom', 'wrong frame', f'{problem}: set odom_frame')
+            return
+        if not self._watch_odom.takes(pose.stamp_ns):
+            return
+        self.diagnostics.tick('odom', pose.stamp_ns)
+        self._odometry = pose
+        self._note(self._keyframe_poses.add_pose(pose))
+        self._tie(self._fixes.add_pose(pose))
+        T_map_odom = self.map.T_map_odom
+        if T_map_odom is None:
+            return
+        if self._authority is not None:
+            self._authority.send(T_map_odom, pose.stamp_ns)
+        if self.map.last is not None:
+            self._publish_pose(pose, message.child_frame_id or self.base_frame)
+
+    def on_gps_fix(self, message: NavSatFix) -> None:
+        """Let a fix wait for the odometry at its stamp."""
+        try:
+            fix = fix_from_message(message)
+        except DataError as error:
+            self._reject('gps/fix', 'unusable', str(error))
+            return
+        T_base_antenna = self._transforms.lookup(self.base_frame, message.header.frame_id)
+        if T_base_antenna is None:
+            self._reject('gps/fix', 'no transform', f'no transform to {message.header.frame_id}')
+            return
+        self._tie(self._fixes.add_item(fix.stamp_ns, (fix, T_base_antenna)))
+
+    def on_initialpose(self, message: PoseWithCovarianceStamped) -> None:
+        """Attach a new session to the loaded map where a person says that the vehicle is."""
+        if self.map.located or self._odometry is None:
+            self._reject('initialpose', 'not needed', 'initialpose: no session waits for its place')
+            return
+        try:
+            T_map_base = messages.transform_from_pose(message.pose.pose)
+        except DataError as error:
+            self._reject('initialpose', 'broken', str(error))
+            return
+        self.map.place(T_map_base @ se3.inverse(self._odometry.T_odom_base))
+        self.update()
+
+    def restart(self, path: str) -> None:
+        """Start with an empty map, or in a saved one.
+
+        Raises:
+            MapError: there is no readable map; then nothing changes.
+        """
+        if path:
+            self.map.load(load_map(path))
+        else:
+            self.map.clear()
+        self._map_path, self._newest = path, None
+        self._watch_odom.reset()
+        self.diagnostics.error('session', None)
+        self.update()
+
+    def update(self) -> None:
+        """Take what came into the graph, publish the result, and have new loops judged."""
+        waits = None if self.map.located else 'looking for the vehicle in the loaded map'
+        self.diagnostics.warn('located', waits)
+        with self.diagnostics.stage('graph update'):
+            self.map.graph.update()
+        self.publish_graph()
+        self._have_judged()
+        self._show()
+
+    def publish_graph(self) -> None:
+        """Publish path and keyframe positions, in the order of the keyframes."""
+        graph, last = self.map.graph, self.map.last
+        stamp_ns = 0 if last is None else last.stamp_ns
+        self._corrected = None
+        self._undrawn = self._unmapped = True
+        with self.diagnostics.stage('path'):
+            poses, ids, frame = graph.poses(), graph.ids, self.config.map_frame
+            self._path_out.publish(path_bytes(poses, graph.stamps_ns, stamp_ns, frame))
+            self._positions_out.publish(positions_message(ids, poses, stamp_ns, frame))
+
+    def refresh(self) -> None:
+        """Show what was held back, and say whether map -> odom has another owner."""
+        self._judge.hand_over()
+        self._show(all_of_it=not self.config.threaded)
+        rivals = 0 if self._authority is None else self._authority.rivals
+        edge = f'{self.config.map_frame} -> {self.config.odom_frame}'
+        self.diagnostics.error(
+            'authority',
+            f'another node publishes {edge}: set publish_tf to false on one of them'
+            if rivals > self._rivals
+            else None,
+        )
+        self._rivals = rivals
+
+    def show(self, *, map_cloud: bool = False) -> None:
+        """Publish loops, markers and (map_cloud) the map now, whoever listens."""
+        graph, last = self.map.graph, self.map.last
+        self._undrawn, self._shown_s = False, self._now_s()
+        if map_cloud:
+            self._unmapped, self._mapped_s = False, self._now_s()
+        self._display.show(
+            Shown(
+                graph=graph,
+                points_of=self.map.points_of,
+                ids=graph.ids,
+                T_map_base=graph.poses().copy(),
+                loops=tuple(graph.loops()),
+                candidates=tuple(self.map.candidates),
+                stamp_ns=0 if last is None else last.stamp_ns,
+                base_frame=self.base_frame,
+                map_cloud=map_cloud,
+            )
+        )
+
+    def destroy_node(self) -> None:
+        """Stop the workers and the solver's process, then the node."""
+        self._judge.stop()
+        self._display.stop()
+        super().destroy_node()
+
+    def _same_session(self, keyframe: Keyframe) -> bool:
+        """Tell whether a keyframe may enter; one that starts a session again restarts or not."""
+        first, expected = self.map.first_id, self.map.next_id
+        problem = None
+        if keyframe.id == first and expected is not None and expected > first:
+            problem = 'loop_closure started a new session'
+            if self.config.on_time_jump == 'restart':
+                self.get_logger().warning(f'{problem}: so does the map (on_time_jump: restart)')
+                self.diagnostics.count('sessions restarted')
+                self.restart(self._map_path)
+                return True
+            problem += ': refusing its keyframes until ~/reset is called (on_time_jump: refuse)'
+        elif keyframe.id < first:
+            problem = (
+                f'a map is loaded, but keyframes are numbered from {keyframe.id}: load it in '
+                'loop_closure too (its ~/load_map service or parameter map)'
+            )
+        self.diagnostics.error('session', problem)
+        if problem is not None:
+            self._reject('keyframe', 'other session', problem)
+        return problem is None
+
+    def _forget_odometry(self) -> None:
+        self._keyframe_poses.clear()
+        self._fixes.clear()
+        self._newest = self._odometry = self._corrected = None
+
+    def _note(self, paired: list[Paired[int]]) -> None:
+        """Remember odometry, with its covariance, at the newest keyframe."""
+        self._keyframe_poses.unpaired.clear()
+        for pair in paired:
+            self._newest, self._corrected = (pair.item, pair.pose), None
+
+    def _tie(self, paired: list[Paired[tuple[GnssFix, se3.Array]]]) -> None:
+        """Tie satellite fixes to the newest keyframe."""
+        for _, why in self._fixes.unpaired:
+            self._reject('gps/fix', why.value, f'a fix was dropped: {why.value}')
+        self._fixes.unpaired.clear()
+        for pair in paired:
+            try:
+                self.map.add_gnss(*pair.item, pair.pose.T_odom_base)
+            except DataError as error:
+                self._reject('gps/fix', 'unusable', str(error))
+
+    def _publish_pose(self, odometry: StampedPose, base_frame: str) -> None:
+        if self._corrected is None:
+            self._corrected = self.map.corrected_pose(self._newest)
+        T_map_base, covariance = self._corrected.at(odometry, self._noise)
+        self._pose_out.publish(
+            PoseWithCovarianceStamped(
+                header=messages.header(odometry.stamp_ns, self.config.map_frame),
+                pose=messages.pose_with_covariance(T_map_base, covariance),
+            )
+        )
+
+    def _have_judged(self) -> None:
+        """Ask for a verdict when loops came that none has judged; one at a time."""
+        graph = self.map.graph
+        if not graph.needs_verdict or self._judge.busy:
+            return
+        snapshot = graph.snapshot()
+        if self._asked != (graph, snapshot.arrivals):
+            self._asked = (graph, snapshot.arrivals)
+            self._judge.judge(graph, snapshot)
+
+    def _on_verdict(self, graph: object, verdict: Verdict) -> None:
+        if graph is not self.map.graph:
+            return
+        self.diagnostics.time('solver', verdict.seconds)
+        with self.diagnostics.stage('verdict'):
+            update = self.map.graph.apply(verdict)
+        for kind, loops in (('in', update.loops_in), ('out', update.loops_out)):
+            self.diagnostics.count(f'loops {kind} by verdict', len(loops))
+        self.publish_graph()
+        self._have_judged()
+        self._show()
+
+    def _show(self, *, all_of_it: bool = False) -> None:
+        """Publish what people look at, as often as it is due, or all that was held back."""
+        now_s = self._now_s()
+        map_due = (
+            self._unmapped
+            and now_s - self._mapped_s >= self.config.map_period
+            and self._display.map_wanted
+        )
+        due = all_of_it or now_s - self._shown_s >= self.config.display_period
+        if map_due or (self._undrawn and due):
+            self.show(map_cloud=map_due)
+
+    def _now_s(self) -> float:
+        """Return wall time, or in lock-step the newest keyframe's, so that runs repeat."""
+        if self.config.threaded:
+            return time.monotonic()
+        return 0.0 if self.map.last is None else self.map.last.stamp_ns * 1e-9
+
+    def _reject(self, what: str, cause: str, text: str) -> None:
+        self.diagnostics.count(f'rejected {what}: {cause}')
+        self.get_logger().warning(text, throttle_duration_sec=5.0)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node alone."""
+    return run_node(PoseGraphNode, __doc__ or '', argv)
