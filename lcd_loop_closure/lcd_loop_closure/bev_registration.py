@@ -33,7 +33,7 @@ class BevConfig:
     full_height: float = setting(
         3.0, 'columns at least this tall weigh the same', unit='m', low=0.1
     )
-    hypotheses: int = setting(3, 'best distinct peaks that are handed on', low=1, high=50)
+    hypotheses: int = setting(2, 'best distinct peaks that are handed on', low=1, high=50)
     ground_radius: float = setting(
         15.0, 'ground height is taken from points within this distance', unit='m', low=2.0
     )

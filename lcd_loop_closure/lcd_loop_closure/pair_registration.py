@@ -23,13 +23,13 @@ class PairConfig:
     """Early exits: what they stop would not pass verification, but would cost its time."""
 
     min_bev_score: float = setting(
-        0.15, 'views from above that correlate less are not refined', low=0.0, high=1.0
+        0.18, 'views from above that correlate less are not refined', low=0.0, high=1.0
     )
     near_best: float = setting(
         0.85, 'answers of the global search are tried down to this share of the best score', low=0.0
     )
     min_rough_fitness: float = setting(
-        0.15, 'roughly aligned clouds that fit less are not refined', low=0.0, high=1.0
+        0.2, 'roughly aligned clouds that fit less are not refined', low=0.0, high=1.0
     )
 
 

@@ -26,10 +26,13 @@ class RefinementConfig:
     gate: float = setting(0.8, 'largest distance of partners in the last pass', unit='m', low=0.05)
     max_iterations: int = setting(30, 'of each pass', low=1)
     patch: float = setting(
-        2.0, 'residuals within patches of this size count as dependent', unit='m', low=0.1
+        5.0, 'residuals within patches of this size count as dependent', unit='m', low=0.1
     )
-    sigma_floor: float = setting(
-        0.01, 'smallest standard deviation that is believed', unit='m', low=1e-4
+    model_sigma: float = setting(
+        0.02,
+        'error that residuals cannot show: motion within a sweep, calibration, map deformation',
+        unit='m',
+        low=1e-4,
     )
 
 
@@ -128,22 +131,21 @@ class Refinement:
         near = np.flatnonzero(distance < s.gate)
         if len(near) < 30:
             return None
-        p_query, moved, index = p_query[near], moved[near], index[near]
-        spread_match = np.asarray(match.points.covs())[index, :3, :3]
-        spread_query = np.asarray(query.points.covs())[near, :3, :3]
-        weight = np.linalg.inv(spread_match + R @ spread_query @ R.T)
-        residual = match.xyz[index] - moved
-        # d(T exp(xi) p) / d xi = R [I, -hat(p)]
-        jacobian = np.empty((len(near), 3, 6))
-        jacobian[:, :, :3] = R
-        jacobian[:, :, 3:] = -R @ _hat(p_query)
-        weighted = np.swapaxes(jacobian, 1, 2) @ weight
-        H = (weighted @ jacobian).sum(axis=0)
-        gradient = np.einsum('nij,nj->ni', weighted, residual)
-        cell = np.floor(moved / s.patch).astype(np.int64)
-        cell -= cell.min(axis=0)
-        spans = cell.max(axis=0) + 1
-        patch = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+        p, moved, index = p_query[near], moved[near], index[near]
+        # In the query's axes, where d(exp(xi) p) / d xi = [I, -hat(p)].
+        spread = np.asarray(query.points.covs())[near, :3, :3]
+        spread = spread + R.T @ np.asarray(match.points.covs())[index, :3, :3] @ R
+        weight = _inverse_3x3(spread)
+        residual = (match.xyz[index] - moved) @ R
+        pull = np.einsum('nij,nj->ni', weight, residual)
+        gradient = np.hstack([pull, np.cross(p, pull)])
+        turned = np.cross(p[:, None, :], weight)  # hat(p) @ weight, row by row of weight
+        H = np.empty((6, 6))
+        H[:3, :3] = weight.sum(axis=0)
+        H[:3, 3:] = turned.sum(axis=0)
+        H[3:, :3] = H[:3, 3:].T
+        H[3:, 3:] = np.cross(p[:, :, None], turned, axis=1).sum(axis=0)
+        patch = _patches(moved, s.patch)
         order = np.argsort(patch, kind='stable')
         start = np.flatnonzero(np.r_[True, np.diff(patch[order]) > 0])
         sums = np.add.reduceat(gradient[order], start)
@@ -153,14 +155,29 @@ class Refinement:
             return None
         covariance = H_inverse @ (sums.T @ sums) @ H_inverse
         lever = max(float(np.sqrt(np.mean(p_query[:, :2] ** 2))), 1.0)
-        floor = np.r_[np.full(3, s.sigma_floor**2), np.full(3, (s.sigma_floor / lever) ** 2)]
-        covariance = 0.5 * (covariance + covariance.T) + np.diag(floor)
+        model = np.r_[np.full(3, s.model_sigma**2), np.full(3, (s.model_sigma / lever) ** 2)]
+        covariance = 0.5 * (covariance + covariance.T) + np.diag(model)
         return covariance if se3.is_covariance(covariance) else None
 
 
-def _hat(v: se3.Array) -> se3.Array:
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2] = -v[:, 2], v[:, 1]
-    out[:, 1, 0], out[:, 1, 2] = v[:, 2], -v[:, 0]
-    out[:, 2, 0], out[:, 2, 1] = -v[:, 1], v[:, 0]
+def _patches(xyz: se3.Array, size_m: float) -> NDArray[np.int64]:
+    """Number the cubes that points [N x 3] lie in."""
+    cell = np.floor(xyz / size_m).astype(np.int64)
+    cell -= cell.min(axis=0)
+    spans = cell.max(axis=0) + 1
+    out: NDArray[np.int64] = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    return out
+
+
+def _inverse_3x3(m: se3.Array) -> se3.Array:
+    """Invert symmetric matrices [N x 3 x 3] by cofactors, ten times as fast as LAPACK."""
+    a, b, c = m[:, 0, 0], m[:, 0, 1], m[:, 0, 2]
+    d, e, f = m[:, 1, 1], m[:, 1, 2], m[:, 2, 2]
+    aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
+    out = np.empty_like(m)
+    out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = aa, a * f - c * c, a * d - b * b
+    out[:, 0, 1] = out[:, 1, 0] = ab
+    out[:, 0, 2] = out[:, 2, 0] = ac
+    out[:, 1, 2] = out[:, 2, 1] = b * c - a * e
+    out /= (a * aa + b * ab + c * ac)[:, None, None]
     return out

@@ -28,10 +28,10 @@ class VerificationConfig:
     )
     min_structure: int = setting(200, 'fewest points above the ground that can decide', low=10)
     min_fitness: float = setting(
-        0.5, 'smallest share of the query in common view with a partner', low=0.0, high=1.0
+        0.3, 'smallest share of the structure of the query with a partner', low=0.0, high=1.0
     )
     min_overlap: float = setting(
-        0.3, 'smallest share, of either cloud, of structure with a partner', low=0.0, high=1.0
+        0.25, 'smallest share, of either cloud, of structure with a partner', low=0.0, high=1.0
     )
     max_violations: float = setting(
         0.15, 'largest share of structure in space that was seen empty', low=0.0, high=1.0
