@@ -15,6 +15,7 @@ from bags.records import (
     ImuSample,
     LidarScan,
     Mounting,
+    Record,
     TruthPose,
     TwistSample,
 )
@@ -140,6 +141,15 @@ def mountings_from(message: Any) -> list[Mounting]:
     ]
 
 
+# What each role of a topic becomes, and how.
+KINDS: dict[str, type[Record]] = {
+    'points': LidarScan,
+    'image': CameraImage,
+    'imu': ImuSample,
+    'gnss': GnssFix,
+    'twist': TwistSample,
+    'truth': TruthPose,
+}
 CONVERTERS: dict[str, Callable[[Any], Any]] = {
     'points': scan_from,
     'image': image_from,

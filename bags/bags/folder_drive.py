@@ -2,7 +2,7 @@
 
 import heapq
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -48,13 +48,24 @@ class FolderDrive:
         """List what the drive holds, without reading the sensors' data."""
         return [stream.describe() for stream in self._streams]
 
-    def records(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Record]:
+    def records(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        kinds: Collection[type[Record]] | None = None,
+    ) -> Iterator[Record]:
         """Yield everything between two stamps (inclusive) in stamp order, one sweep at a time.
+
+        With `kinds` only these are read.
 
         Raises:
             DataError: not one sweep of the span can be read.
         """
-        parts = [stream.between(start_ns, end_ns, self._skips) for stream in self._streams]
+        parts = [
+            stream.between(start_ns, end_ns, self._skips)
+            for stream in self._streams
+            if kinds is None or stream.kind in kinds
+        ]
         for _, _, record in heapq.merge(*parts, key=lambda item: item[:2]):
             yield record
 

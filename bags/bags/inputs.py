@@ -16,12 +16,16 @@ def open_input(
     topics: Mapping[str, str] | None = None,
 ) -> Drive:
     """Open a drive as `open_drive` does; `street` and `street:ROUTE` are the analytic town."""
-    word, _, route = str(name).partition(':')
-    if word == 'street' and not Path(name).exists():
+    if is_street(name):
         from bags.street import StreetDrive  # scipy: only for those who drive there
 
-        return StreetDrive(route or 'loop')
+        return StreetDrive(str(name).partition(':')[2] or 'loop')
     return open_drive(Path(name), format=format, sequence=sequence, topics=topics)
+
+
+def is_street(name: str | Path) -> bool:
+    """Tell whether a name means the analytic town; a file or folder of that name comes first."""
+    return str(name).partition(':')[0] == 'street' and not Path(name).exists()
 
 
 def span_ns(

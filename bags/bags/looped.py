@@ -1,7 +1,7 @@
 """Repeat a drive as one long drive."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +44,12 @@ class LoopedDrive:
             for stream in self._drive.streams()
         ]
 
-    def records(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Record]:
+    def records(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        kinds: Collection[type[Record]] | None = None,
+    ) -> Iterator[Record]:
         """Yield the records of every round between two (shifted) stamps, both inclusive."""
         for turn in range(self._rounds):
             shift = turn * self.period_ns
@@ -56,6 +61,7 @@ class LoopedDrive:
             for record in self._drive.records(
                 None if start_ns is None or start_ns <= begin_ns else start_ns - shift,
                 None if end_ns is None else end_ns - shift,
+                kinds,
             ):
                 yield replace(record, stamp_ns=record.stamp_ns + shift) if shift else record
 

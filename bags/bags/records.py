@@ -6,7 +6,7 @@ x right); `imu`; `gps`.
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -125,8 +125,16 @@ class Drive(Protocol):
         """List what the drive holds, without reading the sensors' data."""
         ...
 
-    def records(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Record]:
-        """Yield everything between two stamps (inclusive) in stamp order, one sweep at a time."""
+    def records(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        kinds: Collection[type[Record]] | None = None,
+    ) -> Iterator[Record]:
+        """Yield everything between two stamps (inclusive) in stamp order, one sweep at a time.
+
+        With `kinds` only these are read: a sensor that nobody listens to costs nothing.
+        """
         ...
 
     def truth(self) -> Trajectory | None:

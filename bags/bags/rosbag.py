@@ -2,14 +2,14 @@
 
 import heapq
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bags.bag_records import CONVERTERS, camera_from, mountings_from, stamp_of
+from bags.bag_records import CONVERTERS, KINDS, camera_from, mountings_from, stamp_of
 from bags.bag_source import BagMessage, BagSource, BagTopic
 from bags.bag_topics import choose_topics
 from bags.records import CameraModel, LidarScan, Mounting, Record, Stream, TruthPose
@@ -80,14 +80,21 @@ class RosbagDrive:
             streams.append(Stream(topic.name, topic.type_name, topic.count, first, last))
         return streams
 
-    def records(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Record]:
+    def records(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        kinds: Collection[type[Record]] | None = None,
+    ) -> Iterator[Record]:
         """Yield everything between two stamps (inclusive) in stamp order, one sweep at a time.
+
+        With `kinds` only these are read.
 
         Raises:
             DataError: the bag has clouds in the span, and not one of them can be read.
         """
         read, failure = 0, ''
-        for topic, log_ns, record in self._in_order(start_ns, end_ns):
+        for topic, log_ns, record in self._in_order(start_ns, end_ns, kinds):
             if isinstance(record, LidarScan):
                 try:
                     record = without_broken_points(record, topic, self._skips)
@@ -120,7 +127,10 @@ class RosbagDrive:
         )
 
     def _in_order(
-        self, start_ns: int | None, end_ns: int | None
+        self,
+        start_ns: int | None,
+        end_ns: int | None,
+        kinds: Collection[type[Record]] | None,
     ) -> Iterator[tuple[str, int, Record | UnreadableError]]:
         waiting: list[tuple[int, int, int, str, int, Record]] = []
         newest, released = 0, 0
@@ -140,7 +150,8 @@ class RosbagDrive:
                 if (start_ns is None or stamp >= start_ns) and (end_ns is None or stamp <= end_ns):
                     yield topic, log_ns, record
 
-        for found in self._source.messages(list(self._roles), *self._log_span(start_ns, end_ns)):
+        topics = [t for t, role in self._roles.items() if kinds is None or KINDS[role] in kinds]
+        for found in self._source.messages(topics, *self._log_span(start_ns, end_ns)):
             record = self._convert(found)
             if isinstance(record, UnreadableError):
                 if self._roles[found.topic] == 'points':

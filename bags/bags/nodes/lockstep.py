@@ -19,7 +19,7 @@ from tqdm import tqdm
 from bags.bag_messages import BagBytes, encode, static_transforms
 from bags.inputs import open_input, span_ns
 from bags.nodes.ros_messages import decode
-from bags.records import CameraImage, Drive
+from bags.records import CameraImage, Drive, LidarScan
 from bags.topics import CAMERA_INFO_TOPIC, TOPICS
 from lcd_common.errors import ConfigError
 
@@ -145,12 +145,12 @@ class LockStep:
         if drive.mountings:
             yield static_transforms(drive.mountings, begin_ns)
         camera = drive.camera if self._wanted(CAMERA_INFO_TOPIC) else None
-        for record in drive.records(begin_ns, end_ns):
-            info = camera if isinstance(record, CameraImage) else None
-            if info or self._wanted(TOPICS[type(record)][0]):
-                yield from encode(record, info)
-            else:
-                self.set_time(record.stamp_ns)
+        # Sensors that nobody listens to are not read; sweeps are, as they are what drives time.
+        kinds = {kind for kind, (topic, _) in TOPICS.items() if self._wanted(topic)} | {LidarScan}
+        if camera:
+            kinds.add(CameraImage)
+        for record in drive.records(begin_ns, end_ns, kinds):
+            yield from encode(record, camera)
 
     def _take_over(self, publisher: Publisher) -> Publisher:
         publisher.publish = partial(self._published, publisher.topic_name, publisher.msg_type)

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -112,18 +112,24 @@ class StreetDrive:
                 out.append(Stream(topic, type_name, number, *span))
         return out
 
-    def records(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Record]:
+    def records(
+        self,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        kinds: Collection[type[Record]] | None = None,
+    ) -> Iterator[Record]:
         """Yield everything between two stamps (inclusive) in stamp order."""
         s, rate = self.settings, self.lidar.rate
-        makers: list[tuple[float, Callable[[int], Record]]] = [
-            (s.imu_rate, self._imu),
-            (s.gnss_rate, self._gnss),
-            (rate, self._truth_pose),
-            (rate, self.scan),
+        makers: list[tuple[type[Record], float, Callable[[int], Record]]] = [
+            (ImuSample, s.imu_rate, self._imu),
+            (GnssFix, s.gnss_rate, self._gnss),
+            (TruthPose, rate, self._truth_pose),
+            (LidarScan, rate, self.scan),
         ]
         streams = (
             self._stream(rank, per_second, make, start_ns, end_ns)
-            for rank, (per_second, make) in enumerate(makers)
+            for rank, (kind, per_second, make) in enumerate(makers)
+            if kinds is None or kind in kinds
         )
         for _, _, index, make in heapq.merge(*streams, key=lambda item: item[:2]):
             yield make(index)
