@@ -14,6 +14,10 @@ from bags.scanned_mcap import ScannedMcap
 from bags.skips import Skips
 from lcd_common.errors import DataError
 
+_REMEDIES = {
+    '.bag': 'try `rosbag reindex`, or copy it again',
+    '.db3': 'try `sqlite3 FILE .recover`, or copy it again',
+}
 _STORAGE_SUFFIXES = ('.mcap', '.db3')
 
 
@@ -81,6 +85,10 @@ class BagSource:
                 yield found
                 reached_ns = found.log_ns + 1
         except Exception as error:  # noqa: BLE001 - as above
+            if not self._mcap_files():
+                message = f'{self.path}: readable up to here only: {_reason(error)}'
+                self._skips.add('damaged bag: the rest of it', self.path, message)
+                return
             self._scan(error)
             yield from self.messages(topics, reached_ns, end_ns)
 
@@ -99,7 +107,7 @@ class BagSource:
                     self._skips.add(
                         'message that cannot be decoded',
                         (connection.topic, log_ns),
-                        f'{self.path}: {connection.topic} at {log_ns}: {error}',
+                        f'{self.path}: {connection.topic} at {log_ns}: {_reason(error)}',
                     )
                     continue
                 yield BagMessage(connection.topic, log_ns, message)
@@ -109,14 +117,24 @@ class BagSource:
 
     def _scan(self, error: Exception) -> None:
         """Turn to reading front to back; raises DataError when that is not possible either."""
-        files = [f for f in self._files if f.suffix == '.mcap']
-        files += [
-            f for folder in self._files if folder.is_dir() for f in storage_files(folder, False)
-        ]
-        if not files or any(f.suffix != '.mcap' for f in files):
-            raise DataError(f'{self.path}: not readable as a bag: {error}; copy it again') from None
-        self._skips.note(f'{self.path}: {error}; reading it from front to back instead')
+        files = self._mcap_files()
+        if not files:
+            remedy = _REMEDIES.get(self.path.suffix, _REMEDIES['.db3'])
+            message = f'{self.path}: not readable as a bag: {_reason(error)}; {remedy}'
+            raise DataError(message) from None
+        self._skips.note(f'{self.path}: {_reason(error)}; reading it from front to back instead')
         self._scanned = [ScannedMcap(file, self._skips) for file in files]
+
+    def _mcap_files(self) -> list[Path]:
+        """Return the bag's files if all of them are mcap."""
+        files = [file for path in self._files for file in storage_files(path, False)]
+        return files if all(file.suffix == '.mcap' for file in files) else []
+
+
+def _reason(error: Exception) -> str:
+    """Return what a library has to say about damage, in one short line."""
+    lines = str(error).split('\n')
+    return lines[0][:200] or type(error).__name__
 
 
 def storage_files(path: Path, with_metadata: bool = True) -> list[Path]:

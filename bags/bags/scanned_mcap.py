@@ -5,8 +5,10 @@ end. Everything before the cut is intact, and most of the half chunk can be unpa
 """
 
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ _READ: dict[int, Callable[[ReadDataStream, int], McapRecord]] = {
     Opcode.MESSAGE: Message.read,
     Opcode.CHUNK: lambda stream, length: Chunk.read(stream),
 }
+_DAMAGE = (McapError, struct.error, ValueError, OverflowError, MemoryError)
 # A longer one that runs past the end of the file is not cut off: its length is damaged.
 _LARGEST_CHUNK = 2**30
 _RECORD_HEADER = struct.Struct('<BQ')
@@ -124,7 +127,7 @@ class ScannedMcap:
                     payload = file.read(length)
                     try:
                         yield _READ[opcode](ReadDataStream(BytesIO(payload)), len(payload))
-                    except (McapError, struct.error, ValueError):
+                    except _DAMAGE:
                         break
                 file.seek(min(at, size))
         self._skips.add(
@@ -134,31 +137,28 @@ class ScannedMcap:
         )
 
     def _unpack(self, chunk: Chunk) -> list[McapRecord]:
-        """Return a chunk's records; of one that is cut off, those that are whole."""
+        """Return a chunk's records; of one that is cut off or damaged, those before the damage."""
         try:
             data = _decompressed(chunk)
-            if len(data) < chunk.uncompressed_size:
-                data, crc = _whole_records(data), 0
-            else:
-                crc = chunk.uncompressed_crc
-            return breakup_chunk(
-                Chunk(
-                    compression='',
-                    data=data,
-                    message_start_time=chunk.message_start_time,
-                    message_end_time=chunk.message_end_time,
-                    uncompressed_crc=crc,
-                    uncompressed_size=len(data),
-                ),
-                validate_crc=True,
-            )
-        except (zstandard.ZstdError, RuntimeError, McapError, ValueError, struct.error) as error:
-            self._skips.add(
-                'damaged chunk of a bag',
-                (self.path, chunk.message_start_time),
-                f'{self.path}: the chunk from {chunk.message_start_time} is damaged: {error}',
-            )
+            complete = len(data) == chunk.uncompressed_size  # else cut off, which is counted
+            if complete and chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+                raise ValueError('its checksum does not fit')
+            whole = _whole_records(data)
+            if complete and len(whole) < len(data):
+                self._count_damage(
+                    chunk, f'{len(whole)} of {chunk.uncompressed_size} bytes are read'
+                )
+            return breakup_chunk(replace(chunk, compression='', data=whole))
+        except (zstandard.ZstdError, RuntimeError, *_DAMAGE) as error:
+            self._count_damage(chunk, str(error))
             return []
+
+    def _count_damage(self, chunk: Chunk, why: str) -> None:
+        self._skips.add(
+            'damaged chunk of a bag',
+            (self.path, chunk.message_start_time),
+            f'{self.path}: the chunk from {chunk.message_start_time} is damaged: {why}',
+        )
 
     def _type_name(self, channel: Channel) -> str:
         schema = self._schemas.get(channel.schema_id)

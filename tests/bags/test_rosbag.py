@@ -346,6 +346,43 @@ def test_damaged_chunk_costs_only_itself(bag, points_of):
     assert drive.skipped
 
 
+def test_sqlite_bag_damaged_in_the_middle_gives_what_comes_before(bag, points_of):
+    for n in range(60):
+        bag.cloud(START_NS + n * 10**8, points_of(n, 1000))
+    path = bag.write('db3') / 'bag.db3'
+    data = bytearray(path.read_bytes())
+    page = data.index(points_of(40, 1000).tobytes()[8000:8064]) // 4096 * 4096  # not its row
+    data[page : page + 8] = b'\xff' * 8
+    path.write_bytes(data)
+    drive = open_rosbag(path)
+    assert len(of(LidarScan, drive)) == 40
+    assert drive.skipped == {'damaged bag: the rest of it': 1}
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_random_damage_ends_in_one_line_or_a_counted_skip(bag, points_of, seed):
+    fill(bag, points_of, 8)
+    path = bag.write(compress=seed % 2 == 0) / 'bag.mcap'
+    rng = np.random.default_rng(seed)
+    data = bytearray(path.read_bytes())
+    for at in rng.integers(0, len(data), 30):
+        data[at] = int(rng.integers(256))
+    path.write_bytes(data)
+    records, failure = [], ''
+    try:
+        drive = open_rosbag(path)
+        records = list(drive.records())
+        drive.streams(), drive.truth()
+    except DataError as error:
+        failure = str(error)
+    if failure:
+        assert '\n' not in failure and 'bag.mcap' in failure
+    else:
+        assert drive.skipped or len(records) == 40
+        stamps = [r.stamp_ns for r in records]
+        assert stamps == sorted(stamps)
+
+
 def test_damaged_sqlite_bag_is_an_error_with_a_remedy(bag, points_of):
     fill(bag, points_of)
     path = bag.write('db3') / 'bag.db3'
