@@ -10,6 +10,9 @@ from lcd_common import se3
 from lcd_common.settings import config, setting
 from lcd_loop_closure.weighted_graph import poses_of, relative_covariance
 
+# So few poses are fetched one by one.
+_FEW = 500
+
 
 @config
 class IncrementalConfig:
@@ -34,8 +37,9 @@ class IncrementalSolver:
 
     def __init__(self, settings: IncrementalConfig) -> None:
         turn, move = settings.relinearize_rotation, settings.relinearize_translation
+        self._thresholds = np.repeat([turn, move], 3)
         thresholds = gtsam.ISAM2ThresholdMap()
-        thresholds.insert(('x', np.repeat([turn, move], 3)))
+        thresholds.insert(('x', self._thresholds))
         thresholds.insert(('v', np.full(3, move)))
         thresholds.insert(('b', np.full(6, turn)))
         params = gtsam.ISAM2Params()
@@ -51,6 +55,8 @@ class IncrementalSolver:
         self._removed: list[int] = []
         self._slots: dict[int, int] = {}
         self._next_handle = 0
+        self._keys: list[int] = []
+        self._delta = np.zeros((0, 6))
         self._linearized = np.zeros((0, 4, 4))
         self._poses = np.zeros((0, 4, 4))
 
@@ -61,7 +67,7 @@ class IncrementalSolver:
 
     def add_pose(self, T: se3.Array) -> int:
         """Append a pose with its first estimate; return its row."""
-        row = len(self._linearized) + self._new_rows
+        row = len(self._keys) + self._new_rows
         self._new_values.insert(X(row), gtsam.Pose3(T))
         self._new_rows += 1
         return row
@@ -86,18 +92,43 @@ class IncrementalSolver:
         """Take in what was added and removed, one Gauss-Newton step of what it touches."""
         result = self._isam.update(self._new_factors, self._new_values, self._removed)
         self._slots.update(zip(self._new_handles, result.getNewFactorsIndices(), strict=True))
-        if result.getVariablesRelinearized():
-            self._linearized = poses_of(self._isam.getLinearizationPoint())
-        elif self._new_rows:
-            self._linearized = np.concatenate([self._linearized, poses_of(self._new_values)])
+        self._keys.extend(
+            X(row) for row in range(len(self._keys), len(self._keys) + self._new_rows)
+        )
         self._new_factors = gtsam.NonlinearFactorGraph()
         self._new_values = gtsam.Values()
         self._new_handles = []
         self._removed = []
         self._new_rows = 0
-        # X is the last of the letters in use, so that the poses are the tail of the vector.
-        delta = self._isam.getDelta().vector()[-6 * len(self._linearized) :].reshape(-1, 6)
-        self._poses = _retract(self._linearized, delta)
+        self._read_poses()
+
+    def _read_poses(self) -> None:
+        """Bring the array of poses up to date, touching only what changed.
+
+        GTSAM's own ways to all estimates take 10 ms and more for ten thousand poses. A pose is its
+        linearization point moved by a delta; the former changes only where the delta had passed the
+        threshold, which is gtsam's rule too.
+        """
+        delta = self._isam.getDelta().vector(self._keys).reshape(-1, 6)
+        known = len(self._delta)
+        anew = (np.abs(self._delta) >= self._thresholds).any(axis=1)
+        if anew.any() or known < len(delta):
+            values = self._isam.getLinearizationPoint()
+            if anew.sum() + len(delta) - known < _FEW:
+                rows = np.concatenate([np.nonzero(anew)[0], np.arange(known, len(delta))])
+                grown = np.zeros((len(delta), 4, 4))
+                grown[:known] = self._linearized
+                for row in rows.tolist():
+                    grown[row] = values.atPose3(self._keys[row]).matrix()
+                self._linearized = grown
+            else:
+                self._linearized = poses_of(values)
+        changed = np.ones(len(delta), bool)
+        changed[:known] = anew | (delta[:known] != self._delta).any(axis=1)
+        poses = np.empty_like(self._linearized)
+        poses[:known] = self._poses
+        poses[changed] = _retract(self._linearized[changed], delta[changed])
+        self._poses, self._delta = poses, delta
 
     def pose_covariance(self, row: int) -> se3.Array:
         """Return the marginal 6x6 of a pose, body axes, translation first."""
