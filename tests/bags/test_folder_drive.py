@@ -93,3 +93,17 @@ def test_empty_truth_is_none(tmp_path):
     empty = Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4)))
     drive = FolderDrive('empty', tmp_path, [], Skips(), truth=empty)
     assert drive.truth() is None and drive.streams() == []
+
+
+def test_kinds_that_nobody_asks_for_are_not_read(tmp_path):
+    skips = Skips()
+
+    def unwanted(entry: int, stamp_ns: int) -> LidarScan:
+        raise AssertionError('read')
+
+    streams = [
+        make_stream(ImuSample, 'imu', range(5), range(5), imu, skips),
+        make_stream(LidarScan, 'lidar', range(5), range(5), unwanted, skips),
+    ]
+    drive = FolderDrive('kinds', tmp_path, streams, skips)
+    assert len(list(drive.records(kinds=[ImuSample]))) == 5
