@@ -85,6 +85,10 @@ class OnlineMap:
         newest = self._unplaced[-1] if self._unplaced else self.last
         return None if newest is None else newest.id + 1
 
+    def starts_again(self, keyframe: Keyframe) -> bool:
+        """Tell whether a keyframe has the first id of this session, which goes on already."""
+        return keyframe.id == self.first_id and (self.next_id or 0) > self.first_id
+
     @property
     def located(self) -> bool:
         """False while a new session waits for its place in the loaded map."""

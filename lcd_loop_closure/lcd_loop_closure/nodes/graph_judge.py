@@ -6,6 +6,7 @@ from rclpy.node import Node
 
 from lcd_common.nodes.worker import Worker
 from lcd_loop_closure.graph_snapshot import GraphSnapshot
+from lcd_loop_closure.pose_graph import PoseGraph
 from lcd_loop_closure.robust_solver import RobustSolver, RobustSolverConfig, Verdict
 from lcd_loop_closure.verdict_process import VerdictProcess
 
@@ -14,7 +15,7 @@ class GraphJudge:
     """Solve snapshots one at a time and hand each verdict back on the node's own executor.
 
     Threaded, the solve runs in a process of its own, and a verdict that is ready wakes the
-    executor. Otherwise `judge` returns when the verdict is handed back.
+    executor. Otherwise `consider` returns when the verdict is handed back.
     """
 
     def __init__(
@@ -24,7 +25,7 @@ class GraphJudge:
         *,
         threaded: bool,
         niceness: int,
-        on_verdict: Callable[[object, Verdict], None],
+        on_verdict: Callable[[PoseGraph, Verdict], None],
         on_error: Callable[[Exception], None],
     ) -> None:
         """Make a judge.
@@ -32,18 +33,19 @@ class GraphJudge:
         Args:
             node: whose executor calls `on_verdict`.
             settings: of the solver.
-            threaded: False solves inside `judge`.
+            threaded: False solves inside `consider`.
             niceness: of the solver's process.
-            on_verdict: called with the token given to `judge`, and the verdict.
+            on_verdict: called with the graph that was judged, and the verdict.
             on_error: called on the worker's thread when a solve fails.
         """
         self._threaded, self._on_verdict, self._stopping = threaded, on_verdict, False
         self._process = VerdictProcess(settings, niceness) if threaded else None
         solver = self._process or RobustSolver(settings)
         self._solve = solver.solve
-        self._ready: list[tuple[object, Verdict]] = []
+        self._ready: list[tuple[PoseGraph, Verdict]] = []
+        self._asked: tuple[PoseGraph, int] | None = None
         self._wake = node.create_guard_condition(self.hand_over)
-        self._worker: Worker[tuple[object, GraphSnapshot]] = Worker(
+        self._worker: Worker[tuple[PoseGraph, GraphSnapshot]] = Worker(
             self._work,
             capacity=1,
             threaded=threaded,
@@ -52,14 +54,14 @@ class GraphJudge:
             name=f'{node.get_name()} judge',
         )
 
-    @property
-    def busy(self) -> bool:
-        """True while a snapshot is being solved or its verdict waits to be handed over."""
-        return not self._worker.idle() or bool(self._ready)
-
-    def judge(self, token: object, snapshot: GraphSnapshot) -> None:
-        """Solve a snapshot; `token` comes back with the verdict, to tell an old graph's."""
-        self._worker.put((token, snapshot))
+    def consider(self, graph: PoseGraph) -> None:
+        """Have a graph judged when loops came that nobody has judged; one at a time."""
+        if not graph.needs_verdict or not self._worker.idle() or self._ready:
+            return
+        snapshot = graph.snapshot()
+        if self._asked != (graph, snapshot.arrivals):
+            self._asked = graph, snapshot.arrivals
+            self._worker.put((graph, snapshot))
 
     def hand_over(self) -> None:
         """Hand over the verdicts that are ready, on the caller's thread."""
@@ -73,9 +75,9 @@ class GraphJudge:
             self._process.close()
         self._worker.stop()
 
-    def _work(self, item: tuple[object, GraphSnapshot]) -> None:
-        token, snapshot = item
-        self._ready.append((token, self._solve(snapshot)))
+    def _work(self, item: tuple[PoseGraph, GraphSnapshot]) -> None:
+        graph, snapshot = item
+        self._ready.append((graph, self._solve(snapshot)))
         if self._threaded:
             self._wake.trigger()
         else:

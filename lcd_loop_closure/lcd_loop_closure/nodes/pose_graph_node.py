@@ -36,10 +36,9 @@ from lcd_common.nodes import messages, qos
 from lcd_common.nodes.diagnostics import Diagnostics
 from lcd_common.nodes.parameters import declare_config
 from lcd_common.nodes.spin import run_node
-from lcd_common.nodes.transforms import StaticTransforms, TransformAuthority
+from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
-from lcd_loop_closure.corrected_pose import CorrectedPose
 from lcd_loop_closure.gnss import GnssFix
 from lcd_loop_closure.graph_noise import GraphNoise
 from lcd_loop_closure.graph_settings import GraphSettings
@@ -54,9 +53,11 @@ from lcd_loop_closure.nodes.group_parameters import declare_groups
 from lcd_loop_closure.nodes.map_services import MapServices
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.path_message import path_bytes
+from lcd_loop_closure.nodes.pose_output import PoseOutput
 from lcd_loop_closure.nodes.positions_message import positions_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
 from lcd_loop_closure.online_map import OnlineMap, OnlineMapConfig
+from lcd_loop_closure.pose_graph import PoseGraph
 from lcd_loop_closure.robust_solver import RobustSolverConfig, Verdict
 from lcd_loop_closure.session_anchor import AnchorConfig
 from lcd_msgs.msg import Keyframe as KeyframeMessage
@@ -103,12 +104,15 @@ class PoseGraphNode(Node):
             declare_config(self, AnchorConfig, 'anchor'),
             self.diagnostics.count,
         )
-        self._noise = GraphNoise(graph.noise)
         self._transforms = StaticTransforms(self)
-        self._authority = (
-            TransformAuthority(self, self.config.map_frame, self.config.odom_frame)
-            if self.config.publish_tf
-            else None
+        gap_ns = round(self.config.max_odometry_gap * 1e9)
+        self._pose = PoseOutput(
+            self,
+            self.diagnostics,
+            GraphNoise(graph.noise),
+            frames=(self.config.map_frame, self.config.odom_frame),
+            publish_tf=self.config.publish_tf,
+            max_gap_ns=gap_ns,
         )
         self._judge = GraphJudge(
             self,
@@ -125,8 +129,6 @@ class PoseGraphNode(Node):
             self.config.map_frame,
             threaded=threaded,
         )
-        gap_ns = round(self.config.max_odometry_gap * 1e9)
-        self._keyframe_poses: StampBuffer[int] = StampBuffer(100, gap_ns)
         self._fixes: StampBuffer[tuple[GnssFix, se3.Array]] = StampBuffer(100, gap_ns)
         self._watch_odom = StreamWatch(
             self, self.diagnostics, 'odom', self.config.on_time_jump, self._forget_odometry
@@ -134,16 +136,11 @@ class PoseGraphNode(Node):
         self.paused = False
         self.base_frame = 'base_link'
         self._odometry: StampedPose | None = None
-        self._newest: tuple[int, StampedPose] | None = None  # odometry at the newest keyframe
-        self._corrected: CorrectedPose | None = None
-        self._asked: tuple[object, int] | None = None
-        self._rivals = 0
         self._shown_s = self._mapped_s = -math.inf
         self._undrawn = self._unmapped = False
 
         self._path_out = self.create_publisher(Path, 'path', qos.LATCHED)
         self._positions_out = self.create_publisher(PointCloud2, 'graph/keyframes', qos.LATCHED)
-        self._pose_out = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.RELIABLE)
         self.create_subscription(KeyframeMessage, 'keyframe', self.on_keyframe, qos.RELIABLE)
         self.create_subscription(
             LoopConstraintMessage, 'loop_constraint', self.on_loop_constraint, qos.RELIABLE
@@ -184,7 +181,7 @@ class PoseGraphNode(Node):
         except DataError as error:
             self._reject('keyframe', 'out of order', str(error))
             return
-        self._note(self._keyframe_poses.add_item(keyframe.stamp_ns, keyframe.id))
+        self._pose.add_keyframe(keyframe)
         self.update()
 
     def on_loop_constraint(self, message: LoopConstraintMessage) -> None:
@@ -219,15 +216,8 @@ class PoseGraphNode(Node):
             return
         self.diagnostics.tick('odom', pose.stamp_ns)
         self._odometry = pose
-        self._note(self._keyframe_poses.add_pose(pose))
         self._tie(self._fixes.add_pose(pose))
-        T_map_odom = self.map.T_map_odom
-        if T_map_odom is None:
-            return
-        if self._authority is not None:
-            self._authority.send(T_map_odom, pose.stamp_ns)
-        if self.map.last is not None:
-            self._publish_pose(pose, message.child_frame_id or self.base_frame)
+        self._pose.publish(pose, self.map)
 
     def on_gps_fix(self, message: NavSatFix) -> None:
         """Let a fix wait for the odometry at its stamp."""
@@ -265,8 +255,9 @@ class PoseGraphNode(Node):
             self.map.load(load_map(path))
         else:
             self.map.clear()
-        self._map_path, self._newest = path, None
+        self._map_path = path
         self._watch_odom.reset()
+        self._pose.forget()
         self.diagnostics.error('session', None)
         self.update()
 
@@ -277,14 +268,14 @@ class PoseGraphNode(Node):
         with self.diagnostics.stage('graph update'):
             self.map.graph.update()
         self.publish_graph()
-        self._have_judged()
+        self._judge.consider(self.map.graph)
         self._show()
 
     def publish_graph(self) -> None:
         """Publish path and keyframe positions, in the order of the keyframes."""
         graph, last = self.map.graph, self.map.last
         stamp_ns = 0 if last is None else last.stamp_ns
-        self._corrected = None
+        self._pose.changed()
         self._undrawn = self._unmapped = True
         with self.diagnostics.stage('path'):
             poses, ids, frame = graph.poses(), graph.ids, self.config.map_frame
@@ -295,15 +286,7 @@ class PoseGraphNode(Node):
         """Show what was held back, and say whether map -> odom has another owner."""
         self._judge.hand_over()
         self._show(all_of_it=not self.config.threaded)
-        rivals = 0 if self._authority is None else self._authority.rivals
-        edge = f'{self.config.map_frame} -> {self.config.odom_frame}'
-        self.diagnostics.error(
-            'authority',
-            f'another node publishes {edge}: set publish_tf to false on one of them'
-            if rivals > self._rivals
-            else None,
-        )
-        self._rivals = rivals
+        self._pose.check_authority()
 
     def show(self, *, map_cloud: bool = False) -> None:
         """Publish loops, markers and (map_cloud) the map now, whoever listens."""
@@ -333,9 +316,8 @@ class PoseGraphNode(Node):
 
     def _same_session(self, keyframe: Keyframe) -> bool:
         """Tell whether a keyframe may enter; one that starts a session again restarts or not."""
-        first, expected = self.map.first_id, self.map.next_id
         problem = None
-        if keyframe.id == first and expected is not None and expected > first:
+        if self.map.starts_again(keyframe):
             problem = 'loop_closure started a new session'
             if self.config.on_time_jump == 'restart':
                 self.get_logger().warning(f'{problem}: so does the map (on_time_jump: restart)')
@@ -343,7 +325,7 @@ class PoseGraphNode(Node):
                 self.restart(self._map_path)
                 return True
             problem += ': refusing its keyframes until ~/reset is called (on_time_jump: refuse)'
-        elif keyframe.id < first:
+        elif keyframe.id < self.map.first_id:
             problem = (
                 f'a map is loaded, but keyframes are numbered from {keyframe.id}: load it in '
                 'loop_closure too (its ~/load_map service or parameter map)'
@@ -354,15 +336,9 @@ class PoseGraphNode(Node):
         return problem is None
 
     def _forget_odometry(self) -> None:
-        self._keyframe_poses.clear()
+        self._pose.forget()
         self._fixes.clear()
-        self._newest = self._odometry = self._corrected = None
-
-    def _note(self, paired: list[Paired[int]]) -> None:
-        """Remember odometry, with its covariance, at the newest keyframe."""
-        self._keyframe_poses.unpaired.clear()
-        for pair in paired:
-            self._newest, self._corrected = (pair.item, pair.pose), None
+        self._odometry = None
 
     def _tie(self, paired: list[Paired[tuple[GnssFix, se3.Array]]]) -> None:
         """Tie satellite fixes to the newest keyframe."""
@@ -375,37 +351,16 @@ class PoseGraphNode(Node):
             except DataError as error:
                 self._reject('gps/fix', 'unusable', str(error))
 
-    def _publish_pose(self, odometry: StampedPose, base_frame: str) -> None:
-        if self._corrected is None:
-            self._corrected = self.map.corrected_pose(self._newest)
-        T_map_base, covariance = self._corrected.at(odometry, self._noise)
-        self._pose_out.publish(
-            PoseWithCovarianceStamped(
-                header=messages.header(odometry.stamp_ns, self.config.map_frame),
-                pose=messages.pose_with_covariance(T_map_base, covariance),
-            )
-        )
-
-    def _have_judged(self) -> None:
-        """Ask for a verdict when loops came that none has judged; one at a time."""
-        graph = self.map.graph
-        if not graph.needs_verdict or self._judge.busy:
-            return
-        snapshot = graph.snapshot()
-        if self._asked != (graph, snapshot.arrivals):
-            self._asked = (graph, snapshot.arrivals)
-            self._judge.judge(graph, snapshot)
-
-    def _on_verdict(self, graph: object, verdict: Verdict) -> None:
+    def _on_verdict(self, graph: PoseGraph, verdict: Verdict) -> None:
         if graph is not self.map.graph:
             return
         self.diagnostics.time('solver', verdict.seconds)
         with self.diagnostics.stage('verdict'):
-            update = self.map.graph.apply(verdict)
+            update = graph.apply(verdict)
         for kind, loops in (('in', update.loops_in), ('out', update.loops_out)):
             self.diagnostics.count(f'loops {kind} by verdict', len(loops))
         self.publish_graph()
-        self._have_judged()
+        self._judge.consider(self.map.graph)
         self._show()
 
     def _show(self, *, all_of_it: bool = False) -> None:

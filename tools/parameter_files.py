@@ -1,0 +1,106 @@
+"""Write the nodes' parameter files from the settings that the nodes declare.
+
+    python tools/parameter_files.py          writes lcd_loop_closure/config/*.yaml
+    python tools/parameter_files.py --check  says which of them are out of date
+
+A setting's default, meaning and unit stand in the code alone; this keeps the files true to it.
+"""
+
+import argparse
+import ast
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lcd_common.settings import describe
+from lcd_loop_closure.graph_settings import GraphSettings
+from lcd_loop_closure.keyframes import KeyframeConfig
+from lcd_loop_closure.loop_detector import LoopDetectorSettings
+from lcd_loop_closure.map_cloud import MapCloudConfig
+from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNodeConfig
+from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNodeConfig
+from lcd_loop_closure.online_map import OnlineMapConfig
+from lcd_loop_closure.robust_solver import RobustSolverConfig
+from lcd_loop_closure.session_anchor import AnchorConfig
+
+CONFIG = Path(__file__).resolve().parents[1] / 'lcd_loop_closure' / 'config'
+_COMMENT_AT = 44
+
+
+def parameter_files() -> dict[Path, str]:
+    """Return every parameter file's path and what it must hold."""
+    return {
+        CONFIG / 'loop_closure.yaml': _file(
+            'loop_closure',
+            LoopClosureNodeConfig,
+            {'keyframes': KeyframeConfig, **_groups(LoopDetectorSettings())},
+        ),
+        CONFIG / 'pose_graph.yaml': _file(
+            'pose_graph',
+            PoseGraphNodeConfig,
+            {
+                **_groups(GraphSettings()),
+                'solver': RobustSolverConfig,
+                'online_map': OnlineMapConfig,
+                'anchor': AnchorConfig,
+                'map_cloud': MapCloudConfig,
+            },
+        ),
+    }
+
+
+def _groups(settings: Any) -> dict[str, type]:
+    return {f.name: type(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
+
+
+def _file(node: str, top: type, groups: dict[str, type]) -> str:
+    lines = [
+        f'# Parameters of {node} with their defaults; keep the lines that you change.',
+        '# Written by tools/parameter_files.py.',
+        f'/**/{node}:',
+        '  ros__parameters:',
+        *_rows(top, '    '),
+    ]
+    for name, cls in groups.items():
+        meaning = (cls.__doc__ or '').strip().splitlines()[0]
+        lines += ['', f'    # {meaning}', f'    {name}:', *_rows(cls, '      ')]
+    return '\n'.join(lines) + '\n'
+
+
+def _rows(cls: type, indent: str) -> list[str]:
+    return [
+        f'{indent}{name}: {_yaml(ast.literal_eval(default))}'.ljust(_COMMENT_AT)
+        + f'  # {description}'
+        + (f' [{unit}]' if unit else '')
+        + (f': {bounds}' if '|' in bounds else '')
+        for name, default, unit, bounds, description in describe(cls)
+    ]
+
+
+def _yaml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(value)
+    # YAML 1.1 reads 1e-05 as a word: a number needs its point.
+    return text.replace('e', '.0e') if 'e-' in text and '.' not in text else text
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the files, or with --check compare them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--check', action='store_true', help='only say what is out of date')
+    check = parser.parse_args(argv).check
+    stale = [p for p, text in parameter_files().items() if not p.exists() or p.read_text() != text]
+    for path in stale:
+        if check:
+            sys.stdout.write(f'{path.name} is out of date: run python tools/parameter_files.py\n')
+        else:
+            path.write_text(parameter_files()[path])
+            sys.stdout.write(f'wrote {path}\n')
+    return int(check and bool(stale))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
