@@ -144,7 +144,7 @@ step_packages() {
 
 step_colcon() {
   enter
-  if [[ $system_ros == 1 ]] && command -v colcon > /dev/null; then return; fi
+  # Here even beside a system colcon: executables run with the Python of the colcon that built them.
   say 'colcon: a few seconds'
   pip_install --requirement requirements/colcon.txt
 }
