@@ -75,20 +75,20 @@ step_environment() {
 }
 
 step_dependencies() {
-  local files=(core build dev torch-needs) torch_from=()
+  local files=(core build dev torch-needs) torch_from=() kept index
   enter
   check_prerequisites "$prefix/bin/python"
   [[ $system_ros == 1 ]] || files+=(ros ros-build)
-  if [[ -n ${TORCH_INDEX:-} && ${TORCH_INDEX} != "$(cat "$stamps/torch_index" 2> /dev/null)" ]]; then
-    torch_from=(--index-url "$TORCH_INDEX")
-    python -m pip uninstall --yes --quiet torch 2> /dev/null || true
-  fi
+  kept=$(cat "$stamps/torch_index" 2> /dev/null || true)
+  index=${TORCH_INDEX:-$kept}
+  [[ -z $index ]] || torch_from=(--index-url "$index")
+  [[ $index == "$kept" ]] || python -m pip uninstall --yes --quiet torch 2> /dev/null || true
   say 'Python packages, ROS among them: about 600 MB the first time, some minutes'
   files=("${files[@]/#/--requirement=requirements/}")
   pip_install "${files[@]/%/.txt}"
   say 'torch: 200 MB as CPU build, several GB as CUDA build (TORCH_INDEX= chooses)'
   pip_install "${torch_from[@]}" --requirement requirements/torch.txt
-  printf '%s' "${TORCH_INDEX:-$(cat "$stamps/torch_index" 2> /dev/null)}" > "$stamps/torch_index"
+  printf '%s' "$index" > "$stamps/torch_index"
 }
 
 # Build an interface package and install it into the environment, as if it had come as a wheel.
