@@ -27,6 +27,7 @@ setup(
         'open3d',
         'pillow',
         'pyarrow',
+        'pyyaml',
         'rosbags',
         'scipy',
         'tqdm',
