@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 from lcd_common import se3
 
 Item = TypeVar('Item')
+_JUMP_NS = 1_000_000_000  # streams differ by less, and jumps are longer (StampGuard)
 
 
 class Unpaired(Enum):
@@ -76,9 +77,19 @@ class StampBuffer(Generic[Item]):
         return self._pair()
 
     def clear(self) -> None:
-        """Forget all items and poses (after a clock jump)."""
+        """Forget all items and poses."""
         self._items.clear()
         self._poses.clear()
+
+    def rewind(self, stamp_ns: int) -> None:
+        """Forget what came before the clock jumped back to a stamp.
+
+        The other stream may have jumped already, or will: each is forgotten whole while it is ahead.
+        """
+        if self._poses and self._poses[-1].stamp_ns > stamp_ns + _JUMP_NS:
+            self._poses.clear()
+        if self._items and self._items[-1][0] > stamp_ns + _JUMP_NS:
+            self._items.clear()
 
     def _pair(self) -> list[Paired[Item]]:
         paired = []

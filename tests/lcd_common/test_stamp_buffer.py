@@ -75,6 +75,28 @@ def test_clear_forgets_both_streams() -> None:
     assert buffer.unpaired == []
 
 
+@pytest.mark.parametrize('pose_first', [True, False])
+def test_whichever_stream_jumps_back_first_nothing_of_the_new_time_is_lost(
+    pose_first: bool,
+) -> None:
+    second = 10**9
+    buffer: StampBuffer[str] = StampBuffer(10, second)
+    for stamp in range(50, 60):
+        buffer.add_pose(_pose(stamp * second))
+    buffer.add_item(61 * second, 'before the jump')
+    buffer.rewind(0)
+    if pose_first:
+        assert buffer.add_pose(_pose(0)) == []
+        buffer.rewind(0)
+        paired = buffer.add_item(0, 'after')
+    else:
+        assert buffer.add_item(0, 'after') == []
+        buffer.rewind(0)
+        paired = buffer.add_pose(_pose(0))
+    assert [p.item for p in paired] == ['after']
+    assert len(buffer) == 0 and buffer.unpaired == []
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_any_interleaving_pairs_what_a_search_over_all_poses_pairs(seed: int) -> None:
     random = np.random.default_rng(seed)

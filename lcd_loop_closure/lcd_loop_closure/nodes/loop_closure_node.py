@@ -104,7 +104,7 @@ class LoopClosureNode(Node):
         self._watch_odom = StreamWatch(self, self.diagnostics, 'odom', jumps, self._restart)
         # Odometry follows the clouds: its jump starts the session anew, theirs ends the waiting.
         self._watch_points = StreamWatch(
-            self, self.diagnostics, 'points', 'restart', self._buffer.clear
+            self, self.diagnostics, 'points', 'restart', self._buffer.rewind
         )
         self._scans = self._worker('keyframes', self._make_keyframe, 5, lambda scan: None)
         self._searches = self._worker(
@@ -168,6 +168,7 @@ class LoopClosureNode(Node):
     def on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget all keyframes, those of a loaded map too."""
         self._start('')
+        self._buffer.clear()
         self._reset_watches()
         response.success, response.message = True, 'loop closure starts again'
         return response
@@ -178,8 +179,9 @@ class LoopClosureNode(Node):
         self._searches.stop()
         super().destroy_node()
 
-    def _restart(self) -> None:
+    def _restart(self, stamp_ns: int) -> None:
         self._start(self._map_path)
+        self._buffer.rewind(stamp_ns)
 
     def _start(self, path: str) -> None:
         loaded = load_map(path).keyframes() if path else ()
@@ -187,7 +189,6 @@ class LoopClosureNode(Node):
         if loaded:
             self.get_logger().info(f'{path}: looking for loops with {len(loaded)} keyframes')
         self._session = Session(loaded)
-        self._buffer.clear()
         self._selector.reset()
         self._graph = None
 

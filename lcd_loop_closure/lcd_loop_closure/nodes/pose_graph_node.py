@@ -131,7 +131,7 @@ class PoseGraphNode(Node):
         )
         self._fixes: StampBuffer[tuple[GnssFix, se3.Array]] = StampBuffer(100, gap_ns)
         self._watch_odom = StreamWatch(
-            self, self.diagnostics, 'odom', self.config.on_time_jump, self._forget_odometry
+            self, self.diagnostics, 'odom', self.config.on_time_jump, self._rewind
         )
         self.paused = False
         self.base_frame = 'base_link'
@@ -335,9 +335,10 @@ class PoseGraphNode(Node):
             self._reject('keyframe', 'other session', problem)
         return problem is None
 
-    def _forget_odometry(self) -> None:
+    def _rewind(self, stamp_ns: int) -> None:
+        """Forget odometry: the clock jumped back. The map waits for what loop_closure does."""
         self._pose.forget()
-        self._fixes.clear()
+        self._fixes.rewind(stamp_ns)
         self._odometry = None
 
     def _tie(self, paired: list[Paired[tuple[GnssFix, se3.Array]]]) -> None:

@@ -20,7 +20,7 @@ class StreamWatch:
         diagnostics: Diagnostics,
         stream: str,
         policy: str,
-        restart: Callable[[], None],
+        restart: Callable[[int], None],
     ) -> None:
         """Watch a stream.
 
@@ -29,7 +29,7 @@ class StreamWatch:
             diagnostics: counts what is not let through.
             stream: name of the topic, for people.
             policy: `restart` or `refuse`.
-            restart: called after a jump back under the policy `restart`.
+            restart: called with the new stamp after a jump back under the policy `restart`.
         """
         self._log, self._diagnostics = node.get_logger(), diagnostics
         self._stream, self._policy, self._restart = stream, policy, restart
@@ -60,7 +60,7 @@ class StreamWatch:
             self._diagnostics.error(f'clock {self._stream}', text)
             return False
         self._log.warning(text + ': starting again (on_time_jump: restart)')
-        self._restart()
+        self._restart(stamp_ns)
         self.reset()
         return self._guard.check(stamp_ns) is StampVerdict.NEW
 
