@@ -140,7 +140,7 @@ class StreetDrive:
         stamps = np.array([self._stamp(i, self.lidar.rate) for i in range(number)], np.int64)
         return Trajectory(stamps, self.T_world_base((stamps - self._stamp(0, 1.0)) * 1e-9))
 
-    def T_world_base(self, time_s: ArrayLike) -> se3.Array:  # noqa: N802 (a transform)
+    def T_world_base(self, time_s: ArrayLike) -> se3.Array:
         """Return the poses [N x 4 x 4] of base_link at times [N], seconds after the first sweep."""
         x, y, yaw, travelled = self.route.at(np.atleast_1d(time_s)).T
         xy = np.stack([x, y], axis=1)

@@ -83,6 +83,7 @@ class Town:
         self._driven = cKDTree(driven_xy)
         self._rng = np.random.default_rng(seed)
         self._taken: list[tuple[Array, float, float, float]] = []
+        self._circles: list[tuple[float, float, float]] = []  # around each of them: x, y, radius
         self._mesh = MeshBuilder()
 
     def build(self) -> Mesh:
@@ -170,13 +171,14 @@ class Town:
             return False
         if self._driven.query(outline)[0].min() < from_driven:
             return False
-        for other in self._taken:
-            reach = 0.5 * (np.hypot(length, width) + np.hypot(other[1], other[2]))
-            if np.linalg.norm(other[0] - centre) > reach:
-                continue
+        reach = 0.5 * float(np.hypot(length, width))
+        x, y, reaches = np.array(self._circles).reshape(-1, 3).T
+        for index in np.flatnonzero(np.hypot(x - centre[0], y - centre[1]) < reach + reaches):
+            other = self._taken[index]
             if _inside(outline, *other) or _inside(_outline(*other), centre, length, width, yaw):
                 return False
         self._taken.append((centre, length, width, yaw))
+        self._circles.append((centre[0], centre[1], reach))
         return True
 
     def _on_ground(self, xy: Array) -> Array:
