@@ -17,13 +17,11 @@ from sensor_msgs.msg import PointCloud2
 from bags.nodes.lockstep import LockStep
 from bags.records import Drive
 from lcd_common import se3
-from lcd_common.cloud import PointCloud
 from lcd_common.nodes import messages
 from lcd_common.nodes.diagnostics import Diagnostics
-from lcd_common.nodes.parameters import current_config, overrides
+from lcd_common.nodes.parameters import overrides
 from lcd_common.trajectory import Trajectory
 from lcd_loop_closure.loop import LoopConstraint
-from lcd_loop_closure.map_cloud import MapCloud, MapCloudConfig
 from lcd_loop_closure.map_exports import measured
 from lcd_loop_closure.nodes.conversions import loop_from_message
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
@@ -76,10 +74,12 @@ class OfflineSlam:
         self._scan_stamps: list[int] = []
         self._T_odom_base: dict[int, se3.Array] = {}
         self._loops: dict[tuple[int, int, str], LoopConstraint] = {}
+        self._map: PointCloud2 | None = None
         self.lockstep.listen('/points', self._on_points)
         self.lockstep.listen('/odom', self._on_odom)
         self.lockstep.listen('/loop_constraint', self._on_loop)
         self.lockstep.listen('/loops', self._on_loops)
+        self.lockstep.listen('/map', self._on_map)
 
     def drive(
         self, drive: Drive, start_s: float, duration_s: float | None, progress: bool
@@ -90,6 +90,7 @@ class OfflineSlam:
             self.lockstep.run(drive, start_s=start_s, duration_s=duration_s, progress=progress)
         except KeyboardInterrupt:
             interrupted = True
+        self.pose_graph.show(map_cloud=True)
         if self._scan_stamps:
             for second in range(1, _AFTERWARDS_S + 1):
                 self.lockstep.set_time(self._scan_stamps[-1] + second * 1_000_000_000)
@@ -108,7 +109,7 @@ class OfflineSlam:
             keyframes=Trajectory(graph.stamps_ns, graph.T_map_base),
             loops=tuple(sorted(self._loops.values(), key=lambda loop: loop.query_stamp_ns)),
             truth=drive.truth(),
-            map_cloud=self._map_cloud(),
+            map_cloud=None if self._map is None else messages.cloud_from_message(self._map),
             graph=measured(graph) if len(graph) else None,
             stage_times_ms=self.stage_times_ms,
             counts={
@@ -149,15 +150,8 @@ class OfflineSlam:
             loop = replace(before, status=loop.status, reason=loop.reason or before.reason)
         self._loops[key] = loop
 
-    def _map_cloud(self) -> PointCloud | None:
-        """Assemble the map by the poses of the end: the published one may be older."""
-        online = self.pose_graph.map
-        snapshot = online.graph.snapshot()
-        settings = current_config(self.pose_graph, MapCloudConfig, 'map_cloud')
-        cloud = MapCloud(settings, online.points_of)
-        cloud.update(dict(zip(snapshot.ids.tolist(), snapshot.T_map_base, strict=True)))
-        points = cloud.points()
-        return PointCloud(points) if len(points) else None
+    def _on_map(self, message: PointCloud2) -> None:
+        self._map = message  # converted at the end: only the last one counts
 
 
 def drive_through(

@@ -161,7 +161,9 @@ def _warnings(result: DriveResult, after: TrajectoryErrors | None) -> list[str]:
         f'{node.strip("/")}: {cause} ({count}).'
         for node, counts in result.counts.items()
         for cause, count in counts.items()
-        if count and any(word in cause.lower() for word in _TROUBLE) and 'candidate' not in cause
+        if count
+        and any(word in cause.lower() for word in _TROUBLE)
+        and not cause.startswith('loops ')
     ]
     if result.truth is not None and after is None:
         texts.append('The reference has no pose at the time of the scans: nothing is compared.')

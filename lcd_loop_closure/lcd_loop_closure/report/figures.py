@@ -116,7 +116,7 @@ def _loops_over_time(
         path,
         'Loops over time',
         'The same drive with time as its height: every bridge is a loop between a visit and '
-        'a later one.',
+        'a later one (not to scale).',
     )
 
 

@@ -8,6 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
@@ -213,7 +214,7 @@ def draw_map(
         ax: axes to draw on.
         cloud: in the map frame.
         trajectory: drawn on top; None leaves it out.
-        pixels: along the longer side; every one shows its highest point.
+        pixels: at most, along the longer side; every one shows its highest point.
 
     Returns:
         The image, for a colour bar.
@@ -223,7 +224,8 @@ def draw_map(
     xyz = cloud.xyz[((cloud.xyz[:, :2] >= corners[0]) & (cloud.xyz[:, :2] <= corners[1])).all(1)]
     left, bottom = corners[0]
     width, height = np.maximum(corners[1] - corners[0], 1.0)
-    cell = max(width, height) / pixels
+    # Pixels finer than the map's own voxels would leave gaps between its points.
+    cell = max(max(width, height) / pixels, 2.0 * _spacing(xyz[:, :2]))
     rows, columns = int(height / cell) + 1, int(width / cell) + 1
     pixel = ((xyz[:, 1] - bottom) / cell).astype(np.int64) * columns + (
         (xyz[:, 0] - left) / cell
@@ -260,6 +262,15 @@ def legend_below(ax: Axes, handles: Sequence[object] | None = None, columns: int
             columnspacing=1.6,
             handlelength=1.8,
         )
+
+
+def _spacing(xy: NDArray[np.floating]) -> float:
+    """Return the median distance of a point to its neighbour, metres."""
+    if len(xy) < 2:
+        return 1.0
+    sample = xy[:: max(len(xy) // 2000, 1)]
+    away, _ = cKDTree(xy).query(sample, k=2)
+    return float(np.median(away[:, 1]))
 
 
 def _line(ax: Axes, trajectory: Trajectory, **style: object) -> None:
