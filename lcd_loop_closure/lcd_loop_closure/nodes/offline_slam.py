@@ -181,7 +181,7 @@ def drive_through(
         ConfigError: a parameter is wrong.
         DataError: the drive cannot be read.
     """
-    with _own_context() as context:
+    with own_context() as context:
         slam = OfflineSlam(context, parameter_files, threads)
         try:
             wall_s, interrupted = slam.drive(drive, start_s, duration_s, progress)
@@ -192,8 +192,8 @@ def drive_through(
 
 
 @contextmanager
-def _own_context() -> Iterator[Context]:
-    """Yield a ROS context that leaves Ctrl-C alone and is seen by nobody else."""
+def own_context() -> Iterator[Context]:
+    """Yield an initialised ROS context that leaves Ctrl-C alone and that nobody else sees."""
     context = Context()
     name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
     before = os.environ.get(name)
