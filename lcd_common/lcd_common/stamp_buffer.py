@@ -84,7 +84,7 @@ class StampBuffer(Generic[Item]):
     def rewind(self, stamp_ns: int) -> None:
         """Forget what came before the clock jumped back to a stamp.
 
-        The other stream may have jumped already, or will: each is forgotten whole while it is ahead.
+        The other stream may have jumped already, or will: each is forgotten while it is ahead.
         """
         if self._poses and self._poses[-1].stamp_ns > stamp_ns + _JUMP_NS:
             self._poses.clear()

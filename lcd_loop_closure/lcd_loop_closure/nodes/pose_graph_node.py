@@ -151,7 +151,7 @@ class PoseGraphNode(Node):
         )
         if self.config.use_gps:
             self.create_subscription(NavSatFix, 'gps/fix', self.on_gps_fix, qos.SENSOR)
-        self._map_services = MapServices(self, threaded=threaded)
+        self.map_services = MapServices(self, threaded=threaded)
         # Steady: also while simulated time stands still somebody may want to see the map. Lock-step
         # fires what runs by its own clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
