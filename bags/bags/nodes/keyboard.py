@@ -1,5 +1,6 @@
 """Take single keys from the terminal without blocking."""
 
+import os
 import select
 import sys
 import termios
@@ -44,4 +45,5 @@ class Keyboard:
             time.sleep(max(0.0, seconds))
             return ''
         ready, _, _ = select.select([sys.stdin], [], [], max(0.0, seconds))
-        return sys.stdin.read(1) if ready else ''
+        # Not through the text stream: what it buffers, select no longer sees.
+        return os.read(sys.stdin.fileno(), 1).decode(errors='replace') if ready else ''
