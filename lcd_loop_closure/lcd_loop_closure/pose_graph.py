@@ -30,7 +30,7 @@ from lcd_loop_closure.graph_noise import (
     gauge,
     gaussian,
 )
-from lcd_loop_closure.graph_snapshot import IN_GRAPH, GraphSnapshot, LoopKey, LoopState
+from lcd_loop_closure.graph_snapshot import IN_GRAPH, GraphLoop, GraphSnapshot, LoopKey, LoopState
 from lcd_loop_closure.incremental_solver import IncrementalConfig, IncrementalSolver
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint
@@ -110,6 +110,7 @@ class PoseGraph:
         self._incremental = incremental or IncrementalConfig()
         self._gnss = GnssTie(gnss or GnssConfig())
         self._threshold = float(chi2.ppf(self.settings.admission_probability, 6))
+        self._careful = False
         self._solver = IncrementalSolver(self._incremental)
         self._ids: list[int] = []
         self._rows: dict[int, int] = {}
@@ -225,11 +226,14 @@ class PoseGraph:
         started = time.perf_counter()
         before = self._solver.poses
         keyframes, out = self._new_keyframes, tuple(self._taken_out)
+        loops_in, held, farthest_m = self._admit()
+        if keyframes or out or loops_in:
+            self._step()
+        if farthest_m > self._incremental.relinearize_translation:
+            # One linear step does not close a loop that is this far open.
+            self._step()
         self._new_keyframes, self._taken_out = 0, []
-        if keyframes or out or self._new_fixes:
-            self._solver.update()
         self._tie_to_earth()
-        loops_in, held = self._admit()
         return self._report(started, before, keyframes, loops_in, out, held, ())
 
     def apply(self, verdict: Verdict) -> GraphUpdate:
@@ -296,7 +300,7 @@ class PoseGraph:
             KeyError: no update has taken in such a keyframe.
         """
         row = self._rows[keyframe_id]
-        if row >= len(self._solver.poses):
+        if row >= len(self._solver):
             raise KeyError(keyframe_id)
         return self._solver.pose_covariance(row)
 
@@ -370,8 +374,8 @@ class PoseGraph:
         return graph
 
     def _latest(self) -> se3.Array:
-        poses = self._solver.poses
-        return poses[-1] if len(poses) == len(self._ids) else self._newest
+        known = len(self._solver)
+        return self._solver.pose(known - 1) if known == len(self._ids) else self._newest
 
     def _link_factor(self, row: int) -> gtsam.NonlinearFactor:
         if row == 0:
@@ -397,49 +401,66 @@ class PoseGraph:
             self._solver.remove(handle)
             self._taken_out.append(key)
 
-    def _admit(self) -> tuple[list[LoopKey], list[LoopKey]]:
-        """Let waiting loops in that agree with the estimate; return those let in and those held."""
-        loops_in, held, farthest = [], [], 0.0
+    def _admit(self) -> tuple[list[LoopKey], list[LoopKey], float]:
+        """Put waiting loops in that agree with the estimate.
+
+        Return those let in, those held, and the largest shift in metres that one in asks for.
+        """
+        loops_in, held, farthest_m = [], [], 0.0
         for key in self._waiting:
             loop = self._ledger[key]
-            if loop.state is LoopState.BY_HAND:
-                self._put_in(key)
-                loops_in.append(key)
-                farthest = np.inf
+            shift_m, against = np.inf, ''
+            if loop.state is not LoopState.BY_HAND:
+                shift_m, against = self._objection(loop)
+            if against:
+                self._ledger.decide(key, LoopState.HELD, f'{against}; waits for the solver')
+                held.append(key)
                 continue
-            match, query = (self._rows[i] for i in key)
-            poses = self._solver.poses
-            T_error = se3.inverse(poses[match] @ loop.T_match_query) @ poses[query]
-            error = se3.log(T_error)
-            covariance = self._solver.relative_covariance(match, query) + loop.covariance
-            distance = float(error @ np.linalg.solve(covariance, error))
-            metres, radians = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
-            if distance > self._threshold:
-                reason = (
-                    f'contradicts the estimate by {np.sqrt(distance):.1f} sigma (limit '
-                    f'{np.sqrt(self._threshold):.1f}); waits for the solver'
-                )
-            elif (
-                metres > self.settings.admission_distance or radians > self.settings.admission_angle
-            ):
-                reason = (
-                    f'asks for a shift of {metres:.1f} m, {radians:.2f} rad; waits for the solver'
-                )
-            else:
+            if loop.state is not LoopState.BY_HAND:
                 self._ledger.decide(key, LoopState.TENTATIVE, loop.constraint.reason)
-                self._put_in(key)
-                loops_in.append(key)
-                farthest = max(farthest, metres)
-                continue
-            self._ledger.decide(key, LoopState.HELD, reason)
-            held.append(key)
+            self._put_in(key)
+            loops_in.append(key)
+            farthest_m = max(farthest_m, shift_m)
         self._waiting = []
-        if loops_in:
-            self._solver.update()
-        if farthest > self._incremental.relinearize_translation:
-            # One linear step does not close a loop that is this far open.
-            self._solver.update()
-        return loops_in, held
+        return loops_in, held, farthest_m
+
+    def _objection(self, loop: GraphLoop) -> tuple[float, str]:
+        """Return by how many metres a loop differs from the estimate, and why it may not enter."""
+        T_match_query, covariance = self._relative(*(self._rows[i] for i in loop.key))
+        error = se3.log(se3.inverse(loop.T_match_query) @ T_match_query)
+        sigmas = float(np.sqrt(error @ np.linalg.solve(covariance + loop.covariance, error)))
+        metres, radians = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+        limit = np.sqrt(self._threshold)
+        if sigmas > limit:
+            return metres, f'contradicts the estimate by {sigmas:.1f} sigma (limit {limit:.1f})'
+        s = self.settings
+        if metres > s.admission_distance or radians > s.admission_angle:
+            return metres, f'asks for a shift of {metres:.1f} m and {radians:.2f} rad'
+        return metres, ''
+
+    def _relative(self, first: int, second: int) -> tuple[se3.Array, se3.Array]:
+        """Return T_first_second as estimated and its 6x6; keyframes still to be taken in count too.
+
+        Their part is odometry's, which is what an update would make of it.
+        """
+        known = len(self._solver)
+        if min(first, second) >= known:
+            self._step()
+            known = len(self._solver)
+        if first > second:
+            T, covariance = self._relative(second, first)
+            return se3.inverse(T), se3.invert_covariance(T, covariance)
+        last = min(second, known - 1)
+        if first == last:
+            T, covariance = np.eye(4), np.zeros((6, 6))
+        else:
+            T = se3.inverse(self._solver.pose(first)) @ self._solver.pose(last)
+            covariance = self._solver.relative_covariance(first, last)
+        for row in range(last + 1, second + 1):
+            motion = self._motions[row]
+            covariance = se3.compose_covariance(covariance, motion, self._motion_covariances[row])
+            T = T @ motion
+        return T, covariance
 
     def _tie_to_earth(self) -> None:
         """Put satellite fixes in, once it is known where the map lies among them."""
@@ -455,7 +476,7 @@ class PoseGraph:
         if self._gnss.T_enu_map is not None:
             for fix in fixes:
                 self._add_fix(fix)
-            self._solver.update()
+            self._step()
 
     def _add_fix(self, fix: GnssFactor) -> None:
         assert self._gnss.T_enu_map is not None
@@ -487,11 +508,30 @@ class PoseGraph:
             T_new_old = verdict.T_map_base[-1] @ se3.inverse(poses[last])
             self._rebuild(np.concatenate([verdict.T_map_base, T_new_old @ poses[last + 1 :]]))
         else:
+            self._step()
+
+    def _step(self) -> None:
+        """Let iSAM2 take a step; where Cholesky fails, start afresh with QR and stay with it.
+
+        GTSAM refuses to go on by Cholesky where one direction is known 4096 times worse than
+        another, which ten kilometres without a loop, or a link that broke, already make so.
+        """
+        poses = self._solver.poses
+        try:
             self._solver.update()
+        except RuntimeError as error:
+            if self._careful:
+                raise
+            _log.info('the pose graph goes on with QR: %s', str(error).strip().partition('\n')[0])
+            self._careful = True
+            chain = list(poses)
+            for row in range(len(chain), len(self._ids)):
+                chain.append(chain[-1] @ self._motions[row] if chain else np.eye(4))
+            self._rebuild(np.array(chain))
 
     def _rebuild(self, T_map_base: se3.Array) -> None:
         """Start iSAM2 afresh around the given poses with all that is in the graph."""
-        self._solver = IncrementalSolver(self._incremental)
+        self._solver = IncrementalSolver(self._incremental, careful=self._careful)
         for row, T in enumerate(T_map_base):
             self._solver.add_pose(T)
             if row == 0:
@@ -505,7 +545,7 @@ class PoseGraph:
             for fix in self._gnss.factors:
                 self._add_fix(fix)
         if len(T_map_base):
-            self._solver.update()
+            self._step()
 
     def _report(
         self,

@@ -26,6 +26,12 @@ from lcd_loop_closure.graph_snapshot import GraphSnapshot, LoopKey, LoopState
 from lcd_loop_closure.truncated_least_squares import Minimum, TruncatedLeastSquares
 from lcd_loop_closure.weighted_graph import WeightedGraph, Weights
 
+# When covariances count as far too large (squared), and how far the limit may follow them.
+_LARGEST_SCALE = 0.5
+_SMALLEST_SCALE = 1e-6
+_RESCALINGS = 5
+_FEWEST_TO_RESCALE = 30
+
 
 @config
 class RobustSolverConfig:
@@ -129,8 +135,9 @@ class _Judgement:
         self.snapshot = snapshot
         self.graph = WeightedGraph(snapshot)
         self.fixed = np.array([loop.state is LoopState.BY_HAND for loop in snapshot.loops], bool)
-        threshold = float(chi2.ppf(settings.inlier_probability, 6))
-        self.problem = TruncatedLeastSquares(self.graph, threshold, self.fixed)
+        self.nominal_threshold = float(chi2.ppf(settings.inlier_probability, 6))
+        self.scale = 1.0
+        self.problem = TruncatedLeastSquares(self.graph, self.nominal_threshold, self.fixed)
         self.loops = pairs.LoopMeasurements(
             self.graph.ends,
             np.array([loop.T_match_query for loop in snapshot.loops]).reshape(-1, 4, 4),
@@ -141,7 +148,8 @@ class _Judgement:
         """Bridge, minimise, then improve by moves; the graph ends at the returned minimum."""
         if not len(self.fixed):
             return self.problem.settle()
-        minimum = self._minimise(self._bridged(self.snapshot.T_map_base))
+        start = self._bridged(self.snapshot.T_map_base)
+        minimum = self._rescaled(self._minimise(start), start)
         minimum = self._take_in_groups(minimum)
         for _ in range(self.settings.broken_link_trials):
             better = self._give_up_link(minimum)
@@ -152,9 +160,34 @@ class _Judgement:
         self.graph.poses = minimum.poses
         return minimum
 
+    def _rescaled(self, minimum: Minimum, start: se3.Array) -> Minimum:
+        """Solve again with a lower limit where the covariances turn out to be far too large.
+
+        What the accepted factors cost, over their degrees of freedom, is the variance factor of an
+        adjustment; it is one for honest covariances. A graph whose file says 1 m and 0.5 rad for
+        every link (parking-garage) lets a wrong loop fold it for less than a limit in such units.
+        """
+        for _ in range(_RESCALINGS):
+            right = minimum.weights > 0
+            if right.sum() < _FEWEST_TO_RESCALE:
+                break
+            wrong_cost = self.problem.threshold * float((~right).sum())
+            factor = (minimum.cost - wrong_cost) / (6.0 * float(right.sum()))
+            # Twice the sigma, so that heavier tails than Gauss's still pass.
+            scale = max(4.0 * factor, _SMALLEST_SCALE)
+            if scale > _LARGEST_SCALE or scale > 0.7 * self.scale:
+                break
+            self.scale = scale
+            self.problem.threshold = scale * self.nominal_threshold
+            # What the too high limit let in may have folded the graph for good: also start afresh.
+            trials = [self._minimise(poses) for poses in (minimum.poses, start)]
+            minimum = min(trials, key=lambda trial: trial.cost)
+        return minimum
+
     def _minimise(self, start: se3.Array) -> Minimum:
         s = self.settings
-        return self.problem.minimise(start, s.cauchy_scale, s.gnc_start, s.gnc_factor)
+        cauchy_scale = s.cauchy_scale * float(np.sqrt(self.scale))
+        return self.problem.minimise(start, cauchy_scale, s.gnc_start, s.gnc_factor)
 
     def _chain(self, poses: se3.Array) -> pairs.ChainCovariance:
         return pairs.ChainCovariance(poses, self.snapshot.motion_covariances)
@@ -180,27 +213,35 @@ class _Judgement:
 
         Gauss-Newton does not find the way from half a turn off.
         """
-        sigmas = np.sqrt(np.diagonal(self.snapshot.motion_covariances, axis1=1, axis2=2))
-        weak = (sigmas[:, :3].max(axis=1) > self.settings.weak_translation) | (
-            sigmas[:, 3:].max(axis=1) > self.settings.weak_rotation
-        )
-        weak[self.graph.loose_rows] = True
-        weak[0] = False
-        for row in np.nonzero(weak)[0]:
+        self.graph.poses = poses
+        residuals = self.graph.residuals()
+        for row in self._weak_rows():
             ends = self.loops.ends
             across = np.nonzero((ends.min(axis=1) < row) & (ends.max(axis=1) >= row))[0]
-            self.graph.poses = poses
-            if not len(across) or np.any(self.graph.residuals()[across] <= self.problem.threshold):
+            if not len(across) or np.any(residuals[across] <= self.problem.threshold):
                 continue
             groups = self._groups(poses, across)
             if not groups and len(across) > 1:
                 continue
             loops = self._subset(groups[0] if groups else across)
-            links = broken_links.implied_links(poses, loops, int(row))
+            links = broken_links.implied_links(poses, loops, row)
             middle = np.median(links[:, :3, 3], axis=0)
             nearest = int(np.argmin(np.linalg.norm(links[:, :3, 3] - middle, axis=1)))
-            poses = broken_links.moved(poses, int(row), links[nearest])
+            poses = broken_links.moved(poses, row, links[nearest])
+            self.graph.poses = poses
+            residuals = self.graph.residuals()
         return poses
+
+    def _weak_rows(self) -> list[int]:
+        """Return the rows whose link is far less sure than the others, or was given up."""
+        sigmas = np.sqrt(np.diagonal(self.snapshot.motion_covariances, axis1=1, axis2=2))
+        move, turn = sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1)
+        weak = (move > np.maximum(self.settings.weak_translation, 10.0 * np.median(move))) | (
+            turn > np.maximum(self.settings.weak_rotation, 10.0 * np.median(turn))
+        )
+        weak[self.graph.loose_rows] = True
+        weak[0] = False
+        return [int(row) for row in np.nonzero(weak)[0]]
 
     def _take_in_groups(self, minimum: Minimum) -> Minimum:
         """Try each rejected group, and each rejected loop alone, that could lower the cost."""
@@ -235,6 +276,8 @@ class _Judgement:
         self.graph.poses = minimum.poses
         distance = pairs.odometry_distances(self._chain(minimum.poses), self.loops)
         candidates = saving(distance)
+        candidates.sort(key=lambda g: (distance[g].max() / len(g), int(g[0])))
+        candidates = candidates[: 2 * self.settings.group_trials]
         if candidates:
             looked_at = np.array([group[0] for group in candidates])
             distance[looked_at] = self.graph.distances(minimum.weights, looked_at)

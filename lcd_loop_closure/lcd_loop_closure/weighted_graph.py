@@ -100,7 +100,12 @@ class WeightedGraph:
         params.setMaxIterations(iterations)
         params.setRelativeErrorTol(1e-3)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, params)
-        self._values = optimizer.optimize()
+        try:
+            self._values = optimizer.optimize()
+        except RuntimeError:  # too far from isotropic for Cholesky
+            params.setLinearSolverType('MULTIFRONTAL_QR')
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self._values, params)
+            self._values = optimizer.optimize()
         self.iterations += optimizer.iterations()
 
     def step(self, weights: Weights) -> float:
@@ -111,7 +116,10 @@ class WeightedGraph:
             # Of all loops: it serves every choice of weights.
             everything = self._graph(np.ones(len(self._loops)))
             self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(everything)
-        delta = linear.optimize(self._ordering)
+        try:
+            delta = linear.optimize(self._ordering)
+        except RuntimeError:  # too far from isotropic for Cholesky
+            delta = linear.optimize(self._ordering, gtsam.EliminateQR)
         self._values = self._values.retract(delta)
         self.iterations += 1
         return float(np.abs(delta.vector()).max())
