@@ -3,8 +3,8 @@
 Odometry that fails at an abrupt turn goes on with full confidence, and every later loop then
 contradicts it in the same way. So do loops of a street that looks like another. They differ in what
 else is known: giving up one link explains the first with a small displacement at that link, and no
-accepted loop spans it; a look-alike street would need a jump of its own distance, or contradicts the
-loops around it.
+accepted loop spans it; a look-alike street would need a jump of its own distance, or contradicts
+the loops around it.
 """
 
 from dataclasses import dataclass

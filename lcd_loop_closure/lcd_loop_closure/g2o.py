@@ -187,7 +187,7 @@ def measured_graph(snapshot: GraphSnapshot) -> MeasuredGraph:
         np.array([*snapshot.motions[1:], *(loop.T_match_query for loop in loops)]).reshape(
             -1, 4, 4
         ),
-        np.array(
-            [*snapshot.motion_covariances[1:], *(loop.covariance for loop in loops)]
-        ).reshape(-1, 6, 6),
+        np.array([*snapshot.motion_covariances[1:], *(loop.covariance for loop in loops)]).reshape(
+            -1, 6, 6
+        ),
     )

@@ -1,7 +1,7 @@
 """Tie a map to the Earth with satellite fixes.
 
-The first fix is the datum of a local east-north-up frame. Where the map lies in it is found once the
-drive has a baseline: a yaw and a translation, for the map is level within the vehicle's own tilt.
+The first fix is the datum of a local east-north-up frame. Where the map lies in it is found once
+the drive has a baseline: a yaw and a translation, for the map is level within the vehicle's tilt.
 From then on T_enu_map stays as it is and the fixes act on the keyframes; the graph gives its first
 pose the freedom that the alignment's error needs.
 """
@@ -146,7 +146,9 @@ def usable_covariance(fix: GnssFix, settings: GnssConfig) -> se3.Array:
 def align(
     positions_map: se3.Array, positions_enu: se3.Array, settings: GnssConfig
 ) -> se3.Array | None:
-    """Return T_enu_map (yaw and translation) from paired positions [N x 3]; None: too short a baseline.
+    """Return T_enu_map (yaw and translation) from paired positions [N x 3].
+
+    None where the baseline is too short for it.
 
     Least squares in closed form, reweighted by a Cauchy kernel so that a few reflected fixes do not
     turn the map.
@@ -174,7 +176,7 @@ def align(
 
 
 def gnss_factor(factor: GnssFactor, T_enu_map: se3.Array, key: int) -> gtsam.GPSFactorArm:
-    """Return GTSAM's factor on a keyframe's pose, with the antenna's lever arm and a Cauchy kernel."""
+    """Return GTSAM's factor on a keyframe's pose, with lever arm and a Cauchy kernel."""
     R_map_enu = T_enu_map[:3, :3].T
     position_map = R_map_enu @ (factor.position_enu - T_enu_map[:3, 3])
     covariance = R_map_enu @ factor.covariance_enu @ R_map_enu.T

@@ -90,9 +90,17 @@ def gaussian(covariance: se3.Array) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(se3.gtsam_covariance(covariance))
 
 
-def gauge(*, free: bool) -> gtsam.noiseModel.Gaussian:
-    """Return the noise of the first pose: fixed, or free where satellites say where the map lies."""
-    return gaussian(diagonal(10.0, 0.5) if free else diagonal(1e-3, 1e-3))
+def gauge(*, free: bool = False, level: bool = False) -> gtsam.noiseModel.Gaussian:
+    """Return the noise of the first pose.
+
+    It is fixed; free where satellites say where the map lies; `level` leaves roll and pitch to
+    gravity.
+    """
+    if free:
+        return gaussian(diagonal(10.0, 0.5))
+    return gaussian(
+        np.diag(np.square([1e-3, 1e-3, 1e-3, *([0.1, 0.1] if level else [1e-3] * 2), 1e-3]))
+    )
 
 
 def between(

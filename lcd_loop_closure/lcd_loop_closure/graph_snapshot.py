@@ -1,4 +1,4 @@
-"""Hold all that a pose graph has measured, as arrays that can be saved, sent and solved elsewhere."""
+"""Hold all that a pose graph has measured, as arrays to be saved, sent and solved elsewhere."""
 
 from dataclasses import dataclass
 from enum import IntEnum

@@ -1,4 +1,6 @@
-"""Sum up inertial measurements between keyframes (Forster et al., On-Manifold Preintegration, 2017)."""
+"""Sum up inertial measurements between keyframes (Forster et al., On-Manifold
+Preintegration for Real-Time Visual-Inertial Odometry, T-RO 2017).
+"""
 
 from collections import deque
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ from lcd_common.settings import config, setting
 
 @config
 class ImuConfig:
-    """Noise of the inertial sensor, continuous time, as its data sheet or Allan variance gives it."""
+    """Noise of the inertial sensor in continuous time, as its data sheet gives it."""
 
     accelerometer_noise: float = setting(
         0.02, 'accelerometer noise density', unit='m/s^2/sqrt(Hz)', low=1e-8

@@ -81,6 +81,10 @@ class IncrementalSolver:
         T: se3.Array = self._isam.calculateEstimatePose3(self._keys[row]).matrix()
         return T
 
+    def bias(self, row: int) -> gtsam.imuBias.ConstantBias:
+        """Return the estimated IMU bias of a row that has one."""
+        return self._isam.calculateEstimateConstantBias(B(row))
+
     def add_pose(self, T: se3.Array) -> int:
         """Append a pose with its first estimate; return its row."""
         row = len(self._keys) + self._new_rows
@@ -121,8 +125,8 @@ class IncrementalSolver:
     def _read_poses(self) -> None:
         """Bring the array of poses up to date, touching only what changed.
 
-        A pose is its linearization point moved by a delta. The point changes in an update only where
-        the delta had passed the threshold; after two updates unread the first delta is not known.
+        A pose is its linearization point moved by a delta. The point changes in an update only
+        where the delta had passed the threshold; after two updates the first delta is not known.
         """
         delta = self._isam.getDelta().vector(self._keys).reshape(-1, 6)
         known = len(self._delta)

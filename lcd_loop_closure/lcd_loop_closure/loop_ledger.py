@@ -20,7 +20,12 @@ _STATUS = {
 class LoopLedger:
     """Loops by their keyframes' ids; a loop between the same two replaces the earlier one."""
 
-    def __init__(self, loops: tuple[GraphLoop, ...] = (), arrivals: int = 0) -> None:
+    def __init__(self) -> None:
+        self._loops: dict[LoopKey, GraphLoop] = {}
+        self.arrivals = 0
+
+    def restore(self, loops: tuple[GraphLoop, ...], arrivals: int) -> None:
+        """Hold these loops instead."""
         self._loops = {loop.key: loop for loop in loops}
         self.arrivals = arrivals
 

@@ -59,8 +59,8 @@ def cycle_distances(
 ) -> NDArray[np.float64]:
     """Return the squared Mahalanobis distance [K] of the cycle through each pair of loops.
 
-    first, second: [K] indices of loops. The cycle runs back along the first loop, by odometry to the
-    second's match, along the second and by odometry to the first's query.
+    first, second: [K] indices of loops. The cycle runs back along the first loop, by odometry to
+    the second's match, along the second and by odometry to the first's query.
     """
     i, j = loops.ends[first].T
     k, m = loops.ends[second].T

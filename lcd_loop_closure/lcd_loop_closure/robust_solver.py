@@ -1,7 +1,7 @@
 """Find the false loops of a whole graph, and odometry links that broke without saying so.
 
-Every loop is either right, and costs its squared residual, or wrong, and costs a constant: truncated
-least squares with odometry as known inliers. Its minimum is found from a solve with a Cauchy kernel
+Every loop is either right, and costs its squared residual, or wrong, and costs a constant:
+truncated least squares with odometry as known inliers. Its minimum is found from a solve with a Cauchy kernel
 by graduated non-convexity. What that loses in local minima is regained by moves that must lower the
 same cost: take in a group of loops that agree with each other, or give up one odometry link that
 many loops contradict.

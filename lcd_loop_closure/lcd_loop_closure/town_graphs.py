@@ -68,7 +68,7 @@ class TownGraph:
         return chain(self.motions)
 
     def with_loops(self, more: tuple[LoopConstraint, ...]) -> 'TownGraph':
-        """Return the graph with further loops, sorted by query; on the same pair the old one stays."""
+        """Return the graph with further loops, by query; on the same pair the old one stays."""
         taken = {(loop.match_id, loop.query_id) for loop in self.loops}
         new = [loop for loop in more if (loop.match_id, loop.query_id) not in taken]
         ordered = sorted([*self.loops, *new], key=lambda loop: (loop.query_id, loop.match_id))
@@ -116,7 +116,7 @@ def random_false_loops(
 def aliased_false_loops(
     graph: TownGraph, count: int, seed: int, min_distance: float = 15.0
 ) -> tuple[LoopConstraint, ...]:
-    """Invent loops from one stretch to another that agree with each other, as look-alike streets."""
+    """Invent loops between two stretches that agree with each other, as look-alike streets."""
     rng = np.random.default_rng(seed)
     T = graph.T_world_base
     while True:
@@ -257,7 +257,7 @@ def _true_loops(
     noise = _noise(rng, len(T), settings.loop_translation, settings.loop_rotation)
     found = rng.random(len(T)) < settings.loop_share
     for j in range(len(T)):
-        near = [i for i in tree.query_ball_point(positions[j], settings.loop_radius)]
+        near = tree.query_ball_point(positions[j], settings.loop_radius)
         old = [i for i in near if j - i >= settings.minimum_gap]
         if not old or not found[j]:
             continue

@@ -28,7 +28,8 @@ class WeightedGraph:
         self._loose_links: dict[int, gtsam.BetweenFactorPose3] = {}
         self._gnss = [
             gnss_factor(fix, snapshot.T_enu_map, snapshot.row(fix.keyframe_id))
-            for fix in (snapshot.gnss if snapshot.T_enu_map is not None else ())
+            for fix in snapshot.gnss
+            if snapshot.T_enu_map is not None
         ]
         # Satellite fixes say where the map lies; without any the first pose does.
         self._gauge = gauge(free=bool(self._gnss))
@@ -136,7 +137,10 @@ class WeightedGraph:
         That is its squared Mahalanobis distance from the solution, under its own covariance and the
         solution's.
         """
-        marginals = gtsam.Marginals(self._graph(weights), self._values)
+        try:
+            marginals = gtsam.Marginals(self._graph(weights), self._values)
+        except RuntimeError:  # too far from isotropic for Cholesky: nothing can be excluded
+            return np.zeros(len(loops))
         poses = self.poses
         out = np.empty(len(loops))
         for n, k in enumerate(loops):
