@@ -1,0 +1,113 @@
+"""A made-up street through the real nodes in lock-step: before, after, loops, map, figures."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.street import StreetConfig, StreetDrive
+from bags.street.lidar import LidarConfig
+from lcd_common.errors import ConfigError
+from lcd_loop_closure.report.drive_evaluation import evaluate_drive
+from lcd_loop_closure.report.loop_evaluation import Verdict
+from lcd_loop_closure.report.result import DriveResult
+from lcd_loop_closure.report.run_drive import main
+
+pytestmark = pytest.mark.ros
+SECONDS = 48.0  # until a street has been driven for the second time
+
+
+def street() -> StreetDrive:
+    """Return the town block with a coarse scanner at half the rate: seconds, not minutes."""
+    settings = StreetConfig(imu_rate=0.0, gnss_rate=0.0)
+    return StreetDrive('loop', settings, LidarConfig(columns=360, rate=5.0))
+
+
+@pytest.fixture(scope='module')
+def result() -> DriveResult:
+    from lcd_loop_closure.nodes.offline_slam import drive_through
+
+    return drive_through(street(), source='street', duration_s=SECONDS, progress=False)
+
+
+def test_every_scan_has_odometry_and_a_corrected_pose(result: DriveResult) -> None:
+    scans = round(SECONDS * 5.0) + 1
+    assert len(result.scan_stamps_ns) == len(result.odometry) == len(result.corrected()) == scans
+    assert set(result.keyframes.stamps_ns) <= set(result.scan_stamps_ns)
+    assert result.recorded_s == SECONDS and result.wall_s > 0 and not result.interrupted
+
+
+def test_loops_are_found_and_none_is_false(result: DriveResult) -> None:
+    evaluation = evaluate_drive(result)
+    assert evaluation.loops is not None and evaluation.after is not None
+    assert evaluation.loops.count(Verdict.FALSE) == 0
+    assert evaluation.loops.recall is not None and evaluation.loops.recall > 0.8
+    assert evaluation.after.end_error_m < 0.3
+    assert all(loop.reason for loop in result.loops if not loop.accepted)
+
+
+def test_the_map_lies_where_the_walls_are(result: DriveResult) -> None:
+    assert result.map_cloud is not None and len(result.map_cloud) > 10_000
+    reach = np.abs(result.map_cloud.xyz[:, :2]).max()
+    assert 50 < reach < 250
+    assert result.graph is not None
+    assert result.graph.T_world_body is not None
+    np.testing.assert_array_equal(result.graph.T_world_body, result.keyframes.T_world_body)
+    links = len(result.keyframes) - 1
+    assert len(result.graph.edges) - links == len(result.accepted)
+
+
+def test_stages_of_every_node_are_timed(result: DriveResult) -> None:
+    assert set(result.stage_times_ms) == {'/lidar_odometry', '/loop_closure', '/pose_graph'}
+    for stages in result.stage_times_ms.values():
+        assert stages and all(min(times) >= 0 for times in stages.values())
+
+
+def test_one_thread_repeats_to_the_last_bit() -> None:
+    # The first odometry of a process decides on its threads: this one must be its own.
+    script = """
+import hashlib
+from bags.street import StreetDrive
+from lcd_loop_closure.nodes.offline_slam import drive_through
+for _ in range(2):
+    r = drive_through(StreetDrive(), source='', duration_s=4, threads=1, progress=False)
+    poses = r.corrected().T_world_body.tobytes() + r.keyframes.T_world_body.tobytes()
+    print(len(r.odometry), hashlib.sha256(poses).hexdigest())
+"""
+    run = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True, check=True)
+    first, second = run.stdout.splitlines()
+    assert first == second and first.startswith('41 ')
+
+
+def test_parameter_files_reach_the_nodes(tmp_path: Path) -> None:
+    from lcd_loop_closure.nodes.offline_slam import drive_through
+
+    file = tmp_path / 'far.yaml'
+    file.write_text('/loop_closure:\n  ros__parameters:\n    keyframes:\n      distance: 8.0\n')
+    few = drive_through(street(), source='', duration_s=8.0, parameter_files=[file], progress=False)
+    apart = np.linalg.norm(np.diff(few.keyframes.positions, axis=0), axis=1)
+    assert len(apart) and apart.min() > 7.0
+    file.write_text('/loop_closure:\n  ros__parameters:\n    keyframes:\n      distance: -1.0\n')
+    with pytest.raises(ConfigError, match='distance'):
+        drive_through(street(), source='', parameter_files=[file], progress=False)
+
+
+def test_nothing_of_the_environment_is_left_changed() -> None:
+    from lcd_loop_closure.nodes.offline_slam import own_context
+
+    before = dict(os.environ)
+    with own_context() as context:
+        assert context.ok()
+        assert dict(os.environ) == before
+    assert not context.ok()
+
+
+def test_the_command_writes_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / 'out'
+    options = ['--duration', '3', '--out', str(out), '--threads', '1', '--quiet']
+    assert main(options) == 0
+    assert '31 of 31 scans' in capsys.readouterr().out
+    assert (out / 'report.html').is_file() and (out / 'plots' / 'overview.png').is_file()
