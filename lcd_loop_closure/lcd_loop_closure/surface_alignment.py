@@ -1,0 +1,170 @@
+"""Polish a pose against the surfaces of the local map, and tell how well they hold it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_common.se3 import Array
+from lcd_loop_closure.voxel_gaussians import VoxelGaussians
+
+_MIN_POINTS = 6  # a voxel of fewer has no surface worth the name
+_THIN = 0.15  # share of the voxel's size: thinner than this is a surface, wider is not
+_STEEP = 0.7  # cosine of 45 degrees
+_FLOOR_M = 0.002  # quantisation of ranges and angles; keeps weights finite
+_ROUNDS = 3  # Gauss-Newton steps; each looks up its voxels afresh
+_CONVERGED = 1e-4  # metres and radians
+
+
+@dataclass(frozen=True)
+class SurfaceMatches:
+    """Distances of points to the map's surfaces at one pose, linearised.
+
+    Attributes:
+        residual: [M] metres, along each surface's normal.
+        jacobian: [M x 6] of the residual, by a right perturbation of the pose.
+        weight: [M] 1/m^2, inverse variance of the residual; robust.
+        noise: [M] m^2, variance of the residual by the range's noise alone.
+        information_bias: 6x6, what the noise of the normals adds to the information in the mean.
+        point: [M] index of the point of each row.
+        fitness: share of all points that lie where the map has matter, near its surfaces.
+    """
+
+    residual: Array
+    jacobian: Array
+    weight: Array
+    noise: Array
+    information_bias: Array
+    point: NDArray[np.intp]
+    fitness: float
+
+    @property
+    def rmse_m(self) -> float:
+        """Weighted root mean square of the residuals, metres."""
+        if len(self.residual) == 0:
+            return float('inf')
+        return float(np.sqrt(np.average(self.residual**2, weights=self.weight)))
+
+
+def match_surfaces(
+    points: Array, T_map_lidar: Array, surfaces: VoxelGaussians, range_noise: float
+) -> SurfaceMatches:
+    """Measure points against the map's surfaces.
+
+    A flat voxel holds its points along its normal; one that is thin in two directions and upright
+    (a pole, a trunk) holds them in both. A thin lying line is one ring of the scanner on the ground:
+    its normal is anybody's guess, and it moves along with the vehicle, so it is left out.
+
+    Args:
+        points: [N x 3] of the lidar frame, metres.
+        T_map_lidar: pose of the lidar.
+        surfaces: the map.
+        range_noise: standard deviation of a range, metres.
+    """
+    R = T_map_lidar[:3, :3]
+    placed = points @ R.T + T_map_lidar[:3, 3]
+    slots = surfaces.find(placed, _MIN_POINTS)
+    index = np.nonzero(slots >= 0)[0]
+    map_ = surfaces.gaussians(slots[index])
+    offset = placed[index] - map_.mean
+    variance, axes = np.linalg.eigh(map_.covariance)
+    variance = np.maximum(variance, 0.0)
+    thin = (_THIN * surfaces.voxel_size) ** 2
+    flat = (variance[:, 0] < thin) & (variance[:, 1] > thin)
+    upright = np.abs(axes[:, :, 2] @ R[:, 2]) > _STEEP
+    pole = (variance[:, 1] < thin) & (variance[:, 2] > thin) & upright
+    uses = [flat | pole, pole]
+    rows = [np.nonzero(use)[0] for use in uses]
+    row = np.concatenate(rows)
+    side = np.repeat([0, 1], [len(r) for r in rows])
+    normal = axes[row, :, side]
+    residual = np.einsum('ij,ij->i', normal, offset[row])
+    # The beam's noise counts by how squarely it meets the surface.
+    beam = placed[index[row]] - T_map_lidar[:3, 3]
+    squareness = np.einsum('ij,ij->i', normal, beam) / np.linalg.norm(beam, axis=1)
+    noise = range_noise**2 * squareness**2 + _FLOOR_M**2
+    spread = noise + variance[row, side]
+    scaled = np.abs(residual) / np.sqrt(spread)
+    # Geman-McClure as in KISS-ICP, at three times the typical residual.
+    scale = 3.0 * max(1.4826 * float(np.median(scaled)) if len(scaled) else 1.0, 0.5)
+    weight = 1.0 / spread / (1.0 + (scaled / scale) ** 2) ** 2
+    jacobian = _jacobian(points[index[row]], normal @ R)
+    near = slots >= 0
+    near[index[row[np.abs(residual) > 3.0 * np.sqrt(spread)]]] = False
+    bias = _information_bias(
+        points[index], R, weight, row, side, axes, variance, map_.count, noise
+    )
+    return SurfaceMatches(
+        residual,
+        jacobian,
+        weight,
+        noise,
+        bias,
+        index[row],
+        float(near.mean()) if len(near) else 0.0,
+    )
+
+
+def polish(
+    points: Array,
+    T_map_lidar: Array,
+    surfaces: VoxelGaussians,
+    range_noise: float,
+    prior_information: Array,
+) -> Array:
+    """Return the pose that minimises the robust distances to the surfaces, by Gauss-Newton.
+
+    Args:
+        points: [N x 3] of the lidar frame, metres.
+        T_map_lidar: where to start, and what the prior holds on to.
+        surfaces: the map.
+        range_noise: standard deviation of a range, metres.
+        prior_information: 6x6; keeps the directions that the surfaces do not hold.
+    """
+    T = T_map_lidar
+    for _ in range(_ROUNDS):
+        matches = match_surfaces(points, T, surfaces, range_noise)
+        weighted = matches.jacobian * matches.weight[:, None]
+        information = matches.jacobian.T @ weighted + prior_information
+        away = se3.log(se3.inverse(T_map_lidar) @ T)
+        gradient = weighted.T @ matches.residual + prior_information @ away
+        step = -np.linalg.solve(information, gradient)
+        T = T @ se3.exp(step)
+        if float(np.linalg.norm(step)) < _CONVERGED:
+            break
+    return T
+
+
+def _jacobian(points: Array, normal_lidar: Array) -> Array:
+    """Return d(n . (T exp(xi) p))/d(xi) [M x 6] for normals of the lidar frame: n, p x n."""
+    return np.hstack([normal_lidar, np.cross(points, normal_lidar)])
+
+
+def _information_bias(
+    points: Array,
+    R: Array,
+    weight: Array,
+    row: NDArray[np.intp],
+    side: NDArray[np.int64],
+    axes: Array,
+    variance: Array,
+    count: Array,
+    noise: Array,
+) -> Array:
+    """Return what the tilt of noisy normals adds to the information matrix, 6x6.
+
+    A normal fitted to n points with variance l0 across and la along axis a is tilted towards a with
+    the variance l0 / (n la). In a smooth corridor that tilt alone would seem to hold the vehicle
+    along it (errors in variables).
+    """
+    bias = np.zeros((6, 6))
+    across = np.maximum(variance[row, side], noise)
+    pole_rows = np.isin(row, row[side == 1])
+    for axis in (1, 2):
+        use = ~pole_rows if axis == 1 else np.ones(len(row), bool)
+        r = row[use]
+        tilt = across[use] / (count[r] * variance[r, axis])
+        jacobian = _jacobian(points[r], axes[r, :, axis] @ R)
+        bias += jacobian.T @ (jacobian * (weight[use] * tilt)[:, None])
+    return bias
