@@ -11,14 +11,14 @@ from rclpy.clock import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
 from bags.bag_messages import BagBytes, encode, static_transforms
 from bags.inputs import open_input, span_ns
-from bags.nodes.ros_messages import decode
+from bags.nodes.ros_messages import decode, encode_repeatably
 from bags.records import CameraImage, Drive, LidarScan
 from bags.topics import CAMERA_INFO_TOPIC, TOPICS
 from lcd_common.errors import ConfigError
@@ -68,7 +68,10 @@ class LockStep:
             node.create_publisher = partial(self._created, create)  # those made later
 
     def listen(self, topic: str, callback: Callable[[Any], None], *, raw: bool = False) -> None:
-        """Call back with every message of an absolute topic; `raw` gives its serialized bytes."""
+        """Call back with every message of an absolute topic.
+
+        With `raw` it gets the serialized bytes, the same for equal messages.
+        """
         self._observers[topic].append((callback, raw))
 
     def feed(self, topic: str, message: Any, message_class: Any = None) -> None:
@@ -183,7 +186,7 @@ class LockStep:
         for callback, raw in [*receivers, *self._observers[topic]]:
             if raw not in forms:
                 forms[raw] = (
-                    serialize_message(message)
+                    encode_repeatably(message)
                     if raw
                     else deserialize_message(message, message_class)
                 )
