@@ -21,9 +21,15 @@ from lcd_common.settings import config, setting
 class BevConfig:
     """Search space and resolution of the registration from above."""
 
-    cell: float = setting(1.0, 'side of a cell', unit='m', low=0.1, high=5.0)
+    cell: float = setting(1.5, 'side of a cell', unit='m', low=0.1, high=5.0)
     radius: float = setting(60.0, 'structure farther than this is ignored', unit='m', low=10.0)
-    max_shift: float = setting(20.0, 'largest distance searched along x and y', unit='m', low=1.0)
+    max_shift: float = setting(
+        45.0,
+        'largest distance searched along x and y; wider than what is accepted, so that in a street '
+        'that repeats itself the true answer can win',
+        unit='m',
+        low=1.0,
+    )
     yaw_step: float = setting(
         3.0, 'step of the exhaustive yaw search', unit='deg', low=0.5, high=30
     )
@@ -33,7 +39,7 @@ class BevConfig:
     full_height: float = setting(
         3.0, 'columns at least this tall weigh the same', unit='m', low=0.1
     )
-    hypotheses: int = setting(2, 'best distinct peaks that are handed on', low=1, high=50)
+    hypotheses: int = setting(3, 'best distinct peaks that are handed on', low=1, high=50)
     ground_radius: float = setting(
         15.0, 'ground height is taken from points within this distance', unit='m', low=2.0
     )
@@ -153,7 +159,7 @@ class BevRegistration:
     def _suppress(self, volume: NDArray[np.float32], i: int, j: int, k: int) -> None:
         """Remove a peak and its flanks so that the next one is another answer."""
         turns = np.arange(i - 3, i + 4) % len(volume)
-        reach = max(1, int(np.ceil(3.0 / self.settings.cell)))
+        reach = max(1, round(3.0 / self.settings.cell))
         volume[
             turns, max(j - reach, 0) : j + reach + 1, max(k - reach, 0) : k + reach + 1
         ] = -np.inf

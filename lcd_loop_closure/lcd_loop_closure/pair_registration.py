@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.settings import config, setting
-from lcd_loop_closure.bev_registration import BevConfig, BevRegistration, BevView
+from lcd_loop_closure.bev_registration import BevConfig, BevHypothesis, BevRegistration, BevView
 from lcd_loop_closure.loop import LoopStatus
 from lcd_loop_closure.refinement import Refinement, RefinementConfig, Surface
 from lcd_loop_closure.verification import RangeView, Verdict, Verification, VerificationConfig
@@ -25,11 +25,14 @@ class PairConfig:
     min_bev_score: float = setting(
         0.18, 'views from above that correlate less are not refined', low=0.0, high=1.0
     )
-    near_best: float = setting(
-        0.85, 'answers of the global search are tried down to this share of the best score', low=0.0
-    )
     min_rough_fitness: float = setting(
         0.2, 'roughly aligned clouds that fit less are not refined', low=0.0, high=1.0
+    )
+    clear_fitness: float = setting(
+        0.6, 'a rough alignment that fits as well needs no rival to be looked at', low=0.0, high=1.0
+    )
+    max_ambiguity: float = setting(
+        0.6, 'fitness of the best other pose, as a share of the best one', low=0.0, high=1.0
     )
 
 
@@ -117,15 +120,16 @@ class PairRegistration:
             reason = f'views from above correlate {score:.2f}, below {s.min_bev_score:g}'
             return PairResult(rejected, reason)
         with self._timer('refine'):
-            tried = [
-                self._approached(match, query, hypothesis.T_match_query)
-                for hypothesis in hypotheses
-                if hypothesis.score >= s.near_best * score
-            ]
-            fitness, T_match_query = max(tried, key=lambda result: result[0])
+            fitness, rival, T_match_query = self._best(match, query, hypotheses)
             if fitness < s.min_rough_fitness:
                 reason = f'roughly aligned, fitness {fitness:.2f} is below {s.min_rough_fitness:g}'
                 return PairResult(LoopStatus.REJECTED_FITNESS, reason, T_match_query)
+            if rival > s.max_ambiguity * fitness:
+                reason = (
+                    f'another pose fits nearly as well, {rival:.2f} against {fitness:.2f}: '
+                    f'at most {s.max_ambiguity:g} of it is allowed'
+                )
+                return PairResult(rejected, reason, T_match_query)
             refined = self.refinement.refine(match.surface, query.surface, T_match_query)
         T_match_query = refined.T_match_query
         with self._timer('verify'):
@@ -145,9 +149,23 @@ class PairRegistration:
             return PairResult(rejected, reason, T_match_query, None, verdict)
         return PairResult(verdict.status, verdict.reason, T_match_query, covariance, verdict)
 
-    def _approached(
-        self, match: PreparedCloud, query: PreparedCloud, T_match_query: se3.Array
-    ) -> tuple[float, se3.Array]:
-        T = self.refinement.approach(match.surface, query.surface, T_match_query)
-        fitness = self.verification.fitness(match.surface, query.surface, T, query.bev.ground_z)
-        return fitness, T
+    def _best(
+        self, match: PreparedCloud, query: PreparedCloud, hypotheses: list[BevHypothesis]
+    ) -> tuple[float, float, se3.Array]:
+        """Return fitness of the best hypothesis, of the best that ends elsewhere, and the pose."""
+        tried: list[tuple[float, se3.Array]] = []
+        for hypothesis in hypotheses:
+            T = self.refinement.approach(match.surface, query.surface, hypothesis.T_match_query)
+            fitness = self.verification.fitness(match.surface, query.surface, T, query.bev.ground_z)
+            tried.append((fitness, T))
+            if fitness >= self.settings.clear_fitness:
+                break
+        best, T_match_query = max(tried, key=lambda result: result[0])
+        rivals = [fitness for fitness, T in tried if _differ(T_match_query, T)]
+        return best, max(rivals, default=0.0), T_match_query
+
+
+def _differ(T_a_b: se3.Array, T_a_c: se3.Array) -> bool:
+    """Tell whether two roughly refined poses are two answers, not one reached twice."""
+    metres, radians = se3.distance(T_a_b, T_a_c)
+    return metres > 2.0 or radians > 0.25

@@ -41,7 +41,7 @@ class VerificationConfig:
     )
     max_tilt: float = setting(8.0, 'largest roll or pitch between both', unit='deg', low=0.5)
     max_climb: float = setting(2.0, 'largest difference in height', unit='m', low=0.1)
-    max_distance: float = setting(25.0, 'largest distance between both', unit='m', low=1.0)
+    max_distance: float = setting(20.0, 'largest distance between both', unit='m', low=1.0)
 
 
 @dataclass(frozen=True)
