@@ -3,6 +3,7 @@
 import os
 import pty
 import sys
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -190,6 +191,9 @@ def test_keys_pause_step_and_end(
         player = Player(node, source_of(drive), options)
         thread = threading.Thread(target=player.play, daemon=True)
         thread.start()
+        # What is typed before the terminal gives single keys is thrown away.
+        canonical = termios.ICANON
+        assert spin_until([listener], lambda: not termios.tcgetattr(stdin)[3] & canonical)
         for steps in (1, 2, 3):
             os.write(keys, b's')
             assert spin_until([listener], lambda n=steps: len(listener.points) == n)
