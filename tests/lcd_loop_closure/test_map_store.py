@@ -105,7 +105,7 @@ def test_kills_at_random_times_lose_nothing(tmp_path: Path) -> None:
         '    for saved in maps: save_map(saved, sys.argv[2])\n'
     )
     dice = random.Random(0)
-    for _ in range(6):
+    for _ in range(4):
         child = subprocess.Popen(
             [sys.executable, '-c', code, str(Path(__file__).parent), str(target)],
             stdout=subprocess.PIPE,

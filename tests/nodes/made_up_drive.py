@@ -1,5 +1,7 @@
 """Make messages of a small drive for node tests: a circle of 20 m radius, driven more than once."""
 
+from functools import cache
+
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
@@ -38,21 +40,26 @@ def true_pose(step: float) -> np.ndarray:
     )
 
 
+@cache
 def odometry_pose(step: int, drift: float = 0.0) -> np.ndarray:
     """Return T_odom_base of an odometry that turns by `drift` radians a step too much."""
-    T = np.eye(4)
-    for k in range(step):
-        motion = se3.inverse(true_pose(k)) @ true_pose(k + 1)
-        T = T @ motion @ se3.exp([0, 0, 0, 0, 0, drift])
-    return T
+    if step == 0:
+        return np.eye(4)
+    motion = se3.inverse(true_pose(step - 1)) @ true_pose(step)
+    return odometry_pose(step - 1, drift) @ motion @ se3.exp([0, 0, 0, 0, 0, drift])
+
+
+@cache
+def _accumulated(step: int) -> np.ndarray:
+    if step == 0:
+        return 1e-9 * np.eye(6)
+    motion = se3.inverse(true_pose(step - 1)) @ true_pose(step)
+    return se3.compose_covariance(_accumulated(step - 1), motion, LINK)
 
 
 def odom_message(step: int, drift: float = 0.0, covariance: bool = True) -> Odometry:
     """Return odometry at a step, its covariance accumulated since the start."""
-    T, accumulated = odometry_pose(step, drift), 1e-9 * np.eye(6)
-    for k in range(step):
-        motion = se3.inverse(true_pose(k)) @ true_pose(k + 1)
-        accumulated = se3.compose_covariance(accumulated, motion, LINK)
+    T, accumulated = odometry_pose(step, drift), _accumulated(step)
     message = Odometry(header=messages.header(stamp(step), 'odom'), child_frame_id='base_link')
     message.pose = messages.pose_with_covariance(T, accumulated if covariance else None)
     return message
