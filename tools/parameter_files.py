@@ -16,6 +16,7 @@ from typing import Any
 
 from lcd_common.settings import describe
 from lcd_loop_closure.graph_settings import GraphSettings
+from lcd_loop_closure.imu_preintegration import ImuConfig
 from lcd_loop_closure.keyframes import KeyframeConfig
 from lcd_loop_closure.loop_detector import LoopDetectorSettings
 from lcd_loop_closure.map_cloud import MapCloudConfig
@@ -42,6 +43,7 @@ def parameter_files() -> dict[Path, str]:
             PoseGraphNodeConfig,
             {
                 **_groups(GraphSettings()),
+                'imu': ImuConfig,
                 'solver': RobustSolverConfig,
                 'online_map': OnlineMapConfig,
                 'anchor': AnchorConfig,

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, field
 
+from lcd_loop_closure.admission import PoseGraphConfig
 from lcd_loop_closure.gnss import GnssConfig
 from lcd_loop_closure.graph_noise import GraphNoiseConfig
 from lcd_loop_closure.graph_snapshot import GraphSnapshot
 from lcd_loop_closure.incremental_solver import IncrementalConfig
-from lcd_loop_closure.pose_graph import PoseGraph, PoseGraphConfig
+from lcd_loop_closure.pose_graph import PoseGraph
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from lcd_loop_closure.corrected_pose import CorrectedPose
 from lcd_loop_closure.gnss import GnssFix
 from lcd_loop_closure.graph_noise import diagonal
 from lcd_loop_closure.graph_settings import GraphSettings
+from lcd_loop_closure.imu_preintegration import ImuConfig
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint
 from lcd_loop_closure.map_store import Descriptor, SavedMap
@@ -63,11 +64,15 @@ class OnlineMap:
         """Make an empty map; `count` is called with the cause of everything that is left out."""
         self._settings, self._graph_settings, self._anchor_settings = settings, graph, anchor
         self._count = count
+        self._imu: tuple[ImuConfig, se3.Array] | None = None
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
         self.graph = self._graph_settings.make()
+        self._inertial = self._imu is not None
+        if self._imu is not None:
+            self.graph.use_imu(*self._imu)
         self.candidates: deque[LoopConstraint] = deque(maxlen=self._settings.shown_candidates)
         self.last: Keyframe | None = None
         self.first_id = 0
@@ -95,7 +100,7 @@ class OnlineMap:
         return self._anchor is None
 
     @property
-    def T_map_odom(self) -> se3.Array | None:  # noqa: N802 - a transform, as everywhere
+    def T_map_odom(self) -> se3.Array | None:
         """The correction of odometry; None while the session is not located."""
         return self.graph.T_map_odom if self.located else None
 
@@ -193,6 +198,18 @@ class OnlineMap:
         T_keyframe_base = se3.inverse(self.last.T_odom_base) @ T_odom_base
         self.graph.add_gnss(fix, T_base_antenna, T_keyframe_base)
 
+    def use_imu(self, settings: ImuConfig, T_base_imu: se3.Array) -> bool:
+        """Use an inertial sensor in this map and those after it; False in one that has begun.
+
+        Only the first call counts.
+        """
+        if self._imu is None:
+            self._imu = settings, T_base_imu
+            if not len(self.graph):
+                self.graph.use_imu(settings, T_base_imu)
+                self._inertial = True
+        return self._inertial
+
     def corrected_pose(self, newest: tuple[int, StampedPose] | None) -> CorrectedPose:
         """Return the newest keyframe as the graph sees it.
 
@@ -237,7 +254,7 @@ class OnlineMap:
         """Replace everything by a saved map; the next keyframe starts a new session in it."""
         graph = self._graph_settings.restore(saved.graph)  # may raise: then all stays
         self.clear()
-        self.graph = graph
+        self.graph, self._inertial = graph, False
         ids = saved.graph.ids.tolist()
         self._clouds = dict(zip(ids, saved.clouds, strict=True))
         self._descriptors = dict(zip(ids, saved.descriptors, strict=True))

@@ -228,7 +228,7 @@ def test_a_loop_by_hand_and_a_fix_need_their_keyframes() -> None:
         online.add_gnss(fix, np.eye(4), np.eye(4))
     for keyframe in _keyframes():
         online.add_keyframe(keyframe)
-    with pytest.raises(DataError, match='expected a loop between two'):
+    with pytest.raises(DataError, match='expected a loop between'):
         online.add_loop_by_hand(0, 99, np.eye(4), LOOP)
     online.add_loop_by_hand(0, 20, se3.inverse(TRUTH[0]) @ TRUTH[20], LOOP)
     online.graph.update()

@@ -3,9 +3,9 @@
     ros2 run lcd_loop_closure pose_graph --ros-args --params-file config/pose_graph.yaml
 
 Subscribes  keyframe (lcd_msgs/Keyframe), loop_constraint (lcd_msgs/LoopConstraint), odom
-            (nav_msgs/Odometry), /tf_static, gps/fix (sensor_msgs/NavSatFix, with use_gps),
-            initialpose (geometry_msgs/PoseWithCovarianceStamped: where a session starts in a
-            loaded map)
+            (nav_msgs/Odometry), /tf_static, gps/fix (sensor_msgs/NavSatFix, with use_gps), imu
+            (sensor_msgs/Imu, with use_imu), initialpose (geometry_msgs/PoseWithCovarianceStamped:
+            where a session starts in a loaded map)
 Publishes   /tf map -> odom (with publish_tf), pose (geometry_msgs/PoseWithCovarianceStamped, at
             odometry's rate), path (nav_msgs/Path), graph/keyframes (sensor_msgs/PointCloud2: x y z
             id), loops (lcd_msgs/LoopConstraintArray: every loop with the latest verdict),
@@ -28,7 +28,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import NavSatFix, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from lcd_common import se3
 from lcd_common.errors import DataError
@@ -38,15 +38,14 @@ from lcd_common.nodes.parameters import declare_config
 from lcd_common.nodes.spin import run_node
 from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.settings import config, setting
-from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
-from lcd_loop_closure.gnss import GnssFix
+from lcd_common.stamp_buffer import StampedPose
 from lcd_loop_closure.graph_noise import GraphNoise
 from lcd_loop_closure.graph_settings import GraphSettings
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.map_cloud import MapCloudConfig
 from lcd_loop_closure.map_store import load_map
 from lcd_loop_closure.nodes.conversions import keyframe_from_message, loop_from_message
-from lcd_loop_closure.nodes.fix_message import fix_from_message
+from lcd_loop_closure.nodes.extra_sensors import ExtraSensors
 from lcd_loop_closure.nodes.graph_display import GraphDisplay, Shown
 from lcd_loop_closure.nodes.graph_judge import GraphJudge
 from lcd_loop_closure.nodes.group_parameters import declare_groups
@@ -73,6 +72,9 @@ class PoseGraphNodeConfig:
     odom_frame: str = setting('odom', 'frame of odometry')
     publish_tf: bool = setting(True, 'own map -> odom; false when something else does')
     use_gps: bool = setting(False, 'tie keyframes to the satellite fixes of gps/fix')
+    use_imu: bool = setting(
+        False, 'tie keyframes by imu too, and level a new map by gravity (not in a loaded map)'
+    )
     max_odometry_gap: float = setting(
         0.3, 'longest time between two odometry messages to interpolate over', unit='s', low=0.0
     )
@@ -129,7 +131,15 @@ class PoseGraphNode(Node):
             self.config.map_frame,
             threaded=threaded,
         )
-        self._fixes: StampBuffer[tuple[GnssFix, se3.Array]] = StampBuffer(100, gap_ns)
+        self._sensors = ExtraSensors(
+            self,
+            self.map,
+            self._transforms,
+            self._reject,
+            use_gps=self.config.use_gps,
+            use_imu=self.config.use_imu,
+            max_gap_ns=gap_ns,
+        )
         self._watch_odom = StreamWatch(
             self, self.diagnostics, 'odom', self.config.on_time_jump, self._rewind
         )
@@ -149,8 +159,6 @@ class PoseGraphNode(Node):
         self.create_subscription(
             PoseWithCovarianceStamped, 'initialpose', self.on_initialpose, qos.RELIABLE
         )
-        if self.config.use_gps:
-            self.create_subscription(NavSatFix, 'gps/fix', self.on_gps_fix, qos.SENSOR)
         self.map_services = MapServices(self, threaded=threaded)
         # Steady: also while simulated time stands still somebody may want to see the map. Lock-step
         # fires what runs by its own clock.
@@ -176,6 +184,7 @@ class PoseGraphNode(Node):
             return
         self.diagnostics.tick('keyframe', keyframe.stamp_ns)
         self.base_frame = message.child_frame_id or self.base_frame
+        self._sensors.base_frame = self.base_frame
         try:
             self.map.add_keyframe(keyframe)
         except DataError as error:
@@ -216,21 +225,8 @@ class PoseGraphNode(Node):
             return
         self.diagnostics.tick('odom', pose.stamp_ns)
         self._odometry = pose
-        self._tie(self._fixes.add_pose(pose))
+        self._sensors.add_odometry(pose)
         self._pose.publish(pose, self.map)
-
-    def on_gps_fix(self, message: NavSatFix) -> None:
-        """Let a fix wait for the odometry at its stamp."""
-        try:
-            fix = fix_from_message(message)
-        except DataError as error:
-            self._reject('gps/fix', 'unusable', str(error))
-            return
-        T_base_antenna = self._transforms.lookup(self.base_frame, message.header.frame_id)
-        if T_base_antenna is None:
-            self._reject('gps/fix', 'no transform', f'no transform to {message.header.frame_id}')
-            return
-        self._tie(self._fixes.add_item(fix.stamp_ns, (fix, T_base_antenna)))
 
     def on_initialpose(self, message: PoseWithCovarianceStamped) -> None:
         """Attach a new session to the loaded map where a person says that the vehicle is."""
@@ -338,19 +334,8 @@ class PoseGraphNode(Node):
     def _rewind(self, stamp_ns: int) -> None:
         """Forget odometry: the clock jumped back. The map waits for what loop_closure does."""
         self._pose.forget()
-        self._fixes.rewind(stamp_ns)
+        self._sensors.rewind(stamp_ns)
         self._odometry = None
-
-    def _tie(self, paired: list[Paired[tuple[GnssFix, se3.Array]]]) -> None:
-        """Tie satellite fixes to the newest keyframe."""
-        for _, why in self._fixes.unpaired:
-            self._reject('gps/fix', why.value, f'a fix was dropped: {why.value}')
-        self._fixes.unpaired.clear()
-        for pair in paired:
-            try:
-                self.map.add_gnss(*pair.item, pair.pose.T_odom_base)
-            except DataError as error:
-                self._reject('gps/fix', 'unusable', str(error))
 
     def _on_verdict(self, graph: PoseGraph, verdict: Verdict) -> None:
         if graph is not self.map.graph:
