@@ -1,5 +1,6 @@
-"""Sum up inertial measurements between keyframes (Forster et al., On-Manifold
-Preintegration for Real-Time Visual-Inertial Odometry, T-RO 2017).
+"""Sum up inertial measurements between keyframes.
+
+Forster et al., On-Manifold Preintegration for Real-Time Visual-Inertial Odometry, T-RO 2017.
 """
 
 from collections import deque

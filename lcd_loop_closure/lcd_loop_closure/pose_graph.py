@@ -95,7 +95,7 @@ class PoseGraph:
         key = loop.match_id, loop.query_id
         if key[0] not in self._odometry or key[1] not in self._odometry or key[0] == key[1]:
             raise DataError(
-                f'expected a loop between two of the {len(self)} known keyframes, got {key}; dropped'
+                f'expected a loop between two of the {len(self)} keyframes, got {key}; dropped'
             )
         usable = loop.T_match_query is not None and bool(np.isfinite(loop.T_match_query).all())
         if (loop.accepted or by_hand) and not usable:

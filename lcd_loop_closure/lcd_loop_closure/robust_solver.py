@@ -1,10 +1,10 @@
 """Find the false loops of a whole graph, and odometry links that broke without saying so.
 
 Every loop is either right, and costs its squared residual, or wrong, and costs a constant:
-truncated least squares with odometry as known inliers. Its minimum is found from a solve with a Cauchy kernel
-by graduated non-convexity. What that loses in local minima is regained by moves that must lower the
-same cost: take in a group of loops that agree with each other, or give up one odometry link that
-many loops contradict.
+truncated least squares with odometry as known inliers. Its minimum is found from a solve with a
+Cauchy kernel by graduated non-convexity. What that loses in local minima is regained by moves that
+must lower the same cost: take in a group of loops that agree with each other, or give up one
+odometry link that many loops contradict.
 
 GTSAM's bindings hold Python's interpreter lock while they solve, for up to a second on ten thousand
 keyframes: run the solver in a process of its own where callbacks must not wait. Snapshots and
@@ -44,7 +44,7 @@ class RobustSolverConfig:
     gnc_start: float = setting(0.02, 'first mu of graduated non-convexity', low=1e-6)
     gnc_factor: float = setting(2.0, 'growth of mu from stage to stage', low=1.05)
     group_reach: int = setting(40, 'loops are compared within so many keyframes', low=1)
-    group_trials: int = setting(8, 'agreeing groups that are tried in one solve', low=0)
+    group_trials: int = setting(5, 'agreeing groups that are tried in one solve', low=0)
     broken_link_trials: int = setting(
         3, 'links that may be found broken in one solve (0: trust odometry)', low=0
     )
@@ -147,6 +147,9 @@ class _Judgement:
     def run(self) -> Minimum:
         """Bridge, minimise, then improve by moves; the graph ends at the returned minimum."""
         if not len(self.fixed):
+            # Odometry alone has no residual: the estimate is already its minimum.
+            if not self.snapshot.gnss:
+                return Minimum(self.snapshot.T_map_base, np.zeros(0), 0.0)
             return self.problem.settle()
         start = self._bridged(self.snapshot.T_map_base)
         minimum = self._rescaled(self._minimise(start), start)
@@ -323,10 +326,12 @@ class _Judgement:
         return float(min(np.ptp(along[ends[:, side]]) for side in (0, 1)))
 
     def _believe_again(self, minimum: Minimum) -> Minimum:
-        """Tighten links that the loops no longer contradict."""
-        self.graph.poses = minimum.poses
-        residuals = self.graph.link_residuals()
-        healed = [r for r in self.graph.loose_rows if residuals[r] <= self.problem.threshold]
-        for row in healed:
+        """Tighten links where that costs less than giving them up."""
+        for row in self.graph.loose_rows:
             self.graph.tighten(row)
-        return self.problem.settle(minimum.weights, minimum.poses) if healed else minimum
+            trial = self.problem.settle(minimum.weights, minimum.poses)
+            if trial.cost < minimum.cost + self.settings.broken_link_cost:
+                minimum = trial
+            else:
+                self.graph.loosen(row)
+        return minimum

@@ -44,7 +44,7 @@ class WeightedGraph:
                 self.ends, self._T_match_query, self._covariances, strict=True
             )
         ]
-        self._start = gtsam.Pose3(snapshot.T_map_base[0])
+        self._start = gtsam.Pose3(snapshot.T_map_base[0] if len(snapshot) else np.eye(4))
         self._values = values_of(snapshot.T_map_base)
         self.iterations = 0
         self._ordering: gtsam.Ordering | None = None
@@ -73,10 +73,6 @@ class WeightedGraph:
     def tighten(self, row: int) -> None:
         """Believe the link to the previous row again."""
         del self._loose_links[row]
-
-    def link_residuals(self) -> Weights:
-        """Return the squared Mahalanobis distance [N] of every row's link as it was measured."""
-        return np.array([0.0, *(2.0 * link.error(self._values) for link in self._links)])
 
     def residuals(self) -> Weights:
         """Return the squared Mahalanobis distance of every loop, by its own covariance alone."""
