@@ -28,7 +28,8 @@ def write_kitti_folder(drive: Drive, root: Path) -> Path:
     sequence = root / 'sequences' / '00'
     (sequence / 'velodyne').mkdir(parents=True, exist_ok=True)
     (root / 'poses').mkdir(exist_ok=True)
-    times, poses = [], []
+    times: list[float] = []
+    poses: list[se3.Array] = []
     for record in drive.records():
         if not isinstance(record, LidarScan):
             continue

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from benchmarks.nodes.live_recorder import LiveRecorder
 from lcd_common.errors import LocalizationError
 
+Processes = dict[str, 'subprocess.Popen[bytes]']
 NODES = ('lidar_odometry', 'loop_closure', 'pose_graph')
 _QUIET_S = 5.0
 _START_S = 60.0
@@ -95,7 +96,9 @@ def _start_player(bag: Path, log: Path) -> subprocess.Popen[bytes]:
     )
 
 
-def _await_nodes(recorder: LiveRecorder, executor: SingleThreadedExecutor, processes: dict) -> None:
+def _await_nodes(
+    recorder: LiveRecorder, executor: SingleThreadedExecutor, processes: Processes
+) -> None:
     deadline = time.monotonic() + _START_S
     while not set(NODES) <= set(recorder.get_node_names()):
         _check(processes)
@@ -104,14 +107,19 @@ def _await_nodes(recorder: LiveRecorder, executor: SingleThreadedExecutor, proce
         executor.spin_once(timeout_sec=0.1)
 
 
-def _spin_while(executor: SingleThreadedExecutor, condition, processes: dict) -> None:
+def _spin_while(
+    executor: SingleThreadedExecutor, condition: Callable[[], bool], processes: Processes
+) -> None:
     while condition():
         executor.spin_once(timeout_sec=0.1)
         _check(processes)
 
 
 def _settle(
-    recorder: LiveRecorder, executor: SingleThreadedExecutor, processes: dict, max_settle_s: float
+    recorder: LiveRecorder,
+    executor: SingleThreadedExecutor,
+    processes: Processes,
+    max_settle_s: float,
 ) -> None:
     """Wait until no result has come for a while: loop closure works behind the scans."""
     deadline = time.monotonic() + max_settle_s
@@ -124,7 +132,7 @@ def _settle(
             seen, since = now, time.monotonic()
 
 
-def _check(processes: dict) -> None:
+def _check(processes: Processes) -> None:
     for name, process in processes.items():
         if process.poll() is not None:
             raise LiveRunError(f'{name} ended with status {process.returncode}; see its log')
