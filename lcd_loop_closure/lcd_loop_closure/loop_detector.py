@@ -155,7 +155,8 @@ class LoopDetector:
     def restore(self, keyframes: Iterable[Keyframe]) -> None:
         """Remember keyframes of a loaded map; all of them are candidates at once.
 
-        Those without a descriptor of this detector's method get one from their reduced cloud.
+        Those without a descriptor of this detector's method and size get one from their reduced
+        cloud.
         """
         for keyframe in keyframes:
             self._remember(self._arrive(keyframe), restored=True)
@@ -205,8 +206,9 @@ class LoopDetector:
         return self._described(keyframe)
 
     def _described(self, keyframe: Keyframe) -> Keyframe:
-        method = self.descriptor_method
-        if keyframe.descriptor is not None and keyframe.descriptor_method in ('', method):
+        method, descriptor = self.descriptor_method, keyframe.descriptor
+        known = descriptor is not None and descriptor.size == self._descriptor.length
+        if known and keyframe.descriptor_method in ('', method):
             return keyframe
         return replace(keyframe, descriptor=self.describe(keyframe.cloud), descriptor_method=method)
 

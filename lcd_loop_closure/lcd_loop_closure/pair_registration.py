@@ -28,8 +28,8 @@ class PairConfig:
     min_rough_fitness: float = setting(
         0.2, 'roughly aligned clouds that fit less are not refined', low=0.0, high=1.0
     )
-    clear_fitness: float = setting(
-        0.6, 'a rough alignment that fits as well needs no rival to be looked at', low=0.0, high=1.0
+    distinct_score: float = setting(
+        0.75, 'answers of the global search below this share of the best are no rivals', low=0.0
     )
     max_ambiguity: float = setting(
         0.6, 'fitness of the best other pose, as a share of the best one', low=0.0, high=1.0
@@ -155,11 +155,12 @@ class PairRegistration:
         """Return fitness of the best hypothesis, of the best that ends elsewhere, and the pose."""
         tried: list[tuple[float, se3.Array]] = []
         for hypothesis in hypotheses:
+            far_below = hypothesis.score < self.settings.distinct_score * hypotheses[0].score
+            if far_below and tried[0][0] >= self.verification.settings.min_fitness:
+                break
             T = self.refinement.approach(match.surface, query.surface, hypothesis.T_match_query)
             fitness = self.verification.fitness(match.surface, query.surface, T, query.bev.ground_z)
             tried.append((fitness, T))
-            if fitness >= self.settings.clear_fitness:
-                break
         best, T_match_query = max(tried, key=lambda result: result[0])
         rivals = [fitness for fitness, T in tried if _differ(T_match_query, T)]
         return best, max(rivals, default=0.0), T_match_query

@@ -83,59 +83,44 @@ class RadiusSearch:
     ) -> list[NearbyKeyframe]:
         """Return up to `count` of the `eligible` keyframes within the radius, nearest first.
 
-        Without a graph, odometry's own poses are the estimate.
+        `eligible` are ids of `keyframes`. Without a graph, odometry's own poses are the estimate.
         """
-        if not len(eligible) or count < 1:
-            return []
-        positions = self._positions(keyframes, graph)
-        T_map_query = self._pose(query, keyframes, positions)
-        ids = np.array([i for i in eligible if i in positions], np.int64)
-        if not len(ids):
-            return []
-        away = np.linalg.norm(
-            np.array([positions[int(i)] for i in ids]) - T_map_query[:3, 3], axis=1
-        )
-        found = []
-        for at in np.argsort(away, kind='stable')[:count]:
-            if away[at] > self.settings.radius:
-                break
-            match = keyframes[int(ids[at])]
-            T_map_match = self._pose(match, keyframes, positions)
-            found.append(
-                NearbyKeyframe(match.id, float(away[at]), se3.inverse(T_map_match) @ T_map_query)
+        if graph is None:
+            positions = [keyframe.T_odom_base[:3, 3] for keyframe in keyframes.values()]
+            graph = GraphPositions(
+                np.fromiter(keyframes, np.int64), np.array(positions).reshape(-1, 3)
             )
+        at = np.flatnonzero(np.isin(graph.ids, np.asarray(eligible, np.int64)))
+        if not len(at) or count < 1:
+            return []
+        T_map_query = self._pose(query, keyframes, graph)
+        away = np.linalg.norm(graph.xyz[at] - T_map_query[:3, 3], axis=1)
+        found = []
+        for nearest in np.argsort(away, kind='stable')[:count]:
+            if away[nearest] > self.settings.radius:
+                break
+            match = keyframes[int(graph.ids[at[nearest]])]
+            T_match_map = se3.inverse(self._pose(match, keyframes, graph))
+            found.append(NearbyKeyframe(match.id, float(away[nearest]), T_match_map @ T_map_query))
         return found
 
-    @staticmethod
-    def _positions(
-        keyframes: Mapping[int, Keyframe], graph: GraphPositions | None
-    ) -> dict[int, se3.Array]:
-        if graph is None:
-            return {i: keyframe.T_odom_base[:3, 3] for i, keyframe in keyframes.items()}
-        return {int(i): xyz for i, xyz in zip(graph.ids, graph.xyz, strict=True)}
-
     def _pose(
-        self,
-        keyframe: Keyframe,
-        keyframes: Mapping[int, Keyframe],
-        positions: Mapping[int, se3.Array],
+        self, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], graph: GraphPositions
     ) -> se3.Array:
         """Return T_map_base of a keyframe, even of one that the graph does not hold yet."""
-        half = self.settings.window // 2
-        around = range(keyframe.id - half, keyframe.id + half + 1)
-        known = [i for i in around if i in positions and i in keyframes]
-        if not known:
-            # Nothing near in the graph: the graph has not moved odometry as far as is known.
+        window = np.flatnonzero(np.abs(graph.ids - keyframe.id) <= self.settings.window // 2)
+        window = np.array([i for i in window if int(graph.ids[i]) in keyframes], np.int64)
+        if not len(window):
+            # The graph knows nothing near: as far as is known it has not moved odometry.
             return keyframe.T_odom_base
-        odom = np.array([keyframes[i].T_odom_base[:3, 3] for i in known])
-        placed = np.array([positions[i] for i in known])
+        ids, placed = graph.ids[window], graph.xyz[window]
+        odom = np.array([keyframes[int(i)].T_odom_base[:3, 3] for i in ids])
         T_map_odom = _align(odom, placed)
         T_map_base = T_map_odom @ keyframe.T_odom_base
         # The alignment is a mean over the window; the nearest known keyframe is exact.
-        closest = int(np.argmin([abs(i - keyframe.id) for i in known]))
-        T_map_base[:3, 3] += placed[closest] - (
-            T_map_odom[:3, :3] @ odom[closest] + T_map_odom[:3, 3]
-        )
+        closest = int(np.argmin(np.abs(ids - keyframe.id)))
+        aligned = T_map_odom[:3, :3] @ odom[closest] + T_map_odom[:3, 3]
+        T_map_base[:3, 3] += placed[closest] - aligned
         return T_map_base
 
 
