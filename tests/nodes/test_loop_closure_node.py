@@ -268,6 +268,18 @@ def test_a_wrong_parameter_is_named(make: Make) -> None:
         make(LoopClosureNode, keyframes__distance=0.0)
 
 
+def test_a_missing_parameter_file_is_named_without_a_traceback() -> None:
+    code = 'from lcd_loop_closure.nodes.loop_closure_node import main; raise SystemExit(main())'
+    words = ['--ros-args', '--params-file', 'no/such.yaml']
+    run = subprocess.run(
+        [sys.executable, '-c', code, *words], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 1
+    last = run.stderr.splitlines()[-1]  # rcl has its own word before
+    assert last.startswith('error: ') and 'no/such.yaml' in last
+    assert 'Traceback' not in run.stderr
+
+
 @pytest.mark.parametrize('node', ['loop_closure', 'pose_graph'])
 def test_help_names_topics_and_services(node: str) -> None:
     code = f'from lcd_loop_closure.nodes.{node}_node import main; raise SystemExit(main())'

@@ -29,13 +29,18 @@ def spin(*nodes: Node) -> None:
 def run_node(make: Callable[[], Node], help_text: str, argv: list[str] | None = None) -> int:
     """Run one node as a console script; `--help` prints its documentation.
 
-    A LocalizationError while it is constructed (a wrong parameter) is one line and status 1.
+    A wrong argument, or a LocalizationError while it is constructed (a wrong parameter), is one
+    line and status 1.
     """
     arguments = sys.argv[1:] if argv is None else argv
     if '-h' in arguments or '--help' in arguments:
         sys.stdout.write(help_text.rstrip() + '\n')
         return 0
-    rclpy.init(args=[sys.argv[0], *arguments])
+    try:
+        rclpy.init(args=[sys.argv[0], *arguments])
+    except RuntimeError as error:  # rcl's own: a parameter file that cannot be read, a bad remap
+        sys.stderr.write(f'error: {str(error).splitlines()[0]}\n')
+        return 1
     try:
         node = make()
     except LocalizationError as error:
