@@ -41,6 +41,7 @@ def write_overview(result: DriveResult, evaluation: DriveEvaluation, path: Path)
     """Draw map and trajectories side by side into one PNG, the picture of a README."""
     with _figure(path, (11.5, 5.2)) as figure:
         left, right = figure.subplots(1, 2)
+        figure.get_layout_engine().set(rect=(0.0, 0.0, 0.985, 1.0))  # room for the last tick label
         if result.map_cloud is not None and len(result.map_cloud):
             drawn = plots.draw_map(left, result.map_cloud, pixels=420)
             figure.colorbar(drawn, ax=left, label='height [m]', shrink=0.6, pad=0.02)

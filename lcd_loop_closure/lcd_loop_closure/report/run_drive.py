@@ -48,6 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    street = arguments.input.partition(':')[0] == 'street'
+    if street and (arguments.format or arguments.sequence or arguments.topic):
+        raise ConfigError('--format, --sequence and --topic choose from a recording; name one')
     drive = open_input(
         arguments.input,
         format=arguments.format,
@@ -160,16 +163,18 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'must be at least 0, got {value}')
-    return value
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f'must be a whole number from 0 on, got {text!r}')
+    return int(text)
 
 
 def _seconds(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
     if not 0 <= value < 1e9:
-        raise argparse.ArgumentTypeError(f'must be at least 0 seconds, got {text}')
+        raise argparse.ArgumentTypeError(f'must be a number of seconds from 0 on, got {text!r}')
     return value
 
 

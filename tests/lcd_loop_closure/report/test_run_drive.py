@@ -128,6 +128,7 @@ def test_a_drive_without_odometry_says_why(
         (['--truth', 'note.txt', '--truth-frame', 'roof'], 'roof'),
         (['--out', 'note.txt'], 'is a file'),
         (['--out', '.'], 'other things'),
+        (['--topic', 'points:=/velodyne'], 'recording'),
         (['.', '--topic', 'points=/velodyne'], 'points:=/velodyne'),
         (['.'], 'no known drive'),
     ],
