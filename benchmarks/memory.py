@@ -19,8 +19,8 @@ _SAMPLE_S = 60.0
 def circuit() -> StreetDrive:
     """Return a lap around one block that ends where it began, slowly driven."""
     corners = [(30, 0), (70, 0), (70, 55), (0, 55), (0, 0), (30, 0)]
-    route = Route(speed=4.0, corner_radius=9.0).through(corners)
-    return StreetDrive(route, StreetConfig(seed=3), LidarConfig(columns=360))
+    route = Route(speed=2.0, corner_radius=9.0).through(corners)
+    return StreetDrive(route, StreetConfig(seed=3), LidarConfig(columns=360, rate=5.0))
 
 
 def evaluate(work: Path) -> dict[str, Any]:
