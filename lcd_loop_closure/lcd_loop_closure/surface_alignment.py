@@ -13,8 +13,8 @@ _MIN_POINTS = 6  # a voxel of fewer has no surface worth the name
 _THIN = 0.15  # share of the voxel's size: thinner than this is a surface, wider is not
 _STEEP = 0.7  # cosine of 45 degrees
 _FLOOR_M = 0.002  # quantisation of ranges and angles; keeps weights finite
-_ROUNDS = 3  # Gauss-Newton steps; each looks up its voxels afresh
-_CONVERGED = 1e-4  # metres and radians
+_ROUNDS = 12  # Gauss-Newton steps at most; each looks up its voxels afresh. Three are usual
+_CONVERGED_M, _CONVERGED_RAD = 5e-4, 5e-5
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ def match_surfaces(
     """Measure points against the map's surfaces.
 
     A flat voxel holds its points along its normal; one that is thin in two directions and upright
-    (a pole, a trunk) holds them in both. A thin lying line is one ring of the scanner on the ground:
-    its normal is anybody's guess, and it moves along with the vehicle, so it is left out.
+    (a pole, a trunk) holds them in both. A thin lying line is one ring of the scanner on the
+    ground: its normal is anybody's guess, and it moves along with the vehicle; it is left out.
 
     Args:
         points: [N x 3] of the lidar frame, metres.
@@ -84,7 +84,8 @@ def match_surfaces(
     beam = placed[index[row]] - T_map_lidar[:3, 3]
     squareness = np.einsum('ij,ij->i', normal, beam) / np.linalg.norm(beam, axis=1)
     noise = range_noise**2 * squareness**2 + _FLOOR_M**2
-    spread = noise + variance[row, side]
+    # Grazing beams are no better than square ones in truth: a scanner's angles have errors too.
+    spread = range_noise**2 + variance[row, side]
     scaled = np.abs(residual) / np.sqrt(spread)
     # Geman-McClure as in KISS-ICP, at three times the typical residual.
     scale = 3.0 * max(1.4826 * float(np.median(scaled)) if len(scaled) else 1.0, 0.5)
@@ -92,9 +93,7 @@ def match_surfaces(
     jacobian = _jacobian(points[index[row]], normal @ R)
     near = slots >= 0
     near[index[row[np.abs(residual) > 3.0 * np.sqrt(spread)]]] = False
-    bias = _information_bias(
-        points[index], R, weight, row, side, axes, variance, map_.count, noise
-    )
+    bias = _information_bias(points[index], R, weight, row, side, axes, variance, map_.count, noise)
     return SurfaceMatches(
         residual,
         jacobian,
@@ -131,7 +130,7 @@ def polish(
         gradient = weighted.T @ matches.residual + prior_information @ away
         step = -np.linalg.solve(information, gradient)
         T = T @ se3.exp(step)
-        if float(np.linalg.norm(step)) < _CONVERGED:
+        if np.linalg.norm(step[:3]) < _CONVERGED_M and np.linalg.norm(step[3:]) < _CONVERGED_RAD:
             break
     return T
 

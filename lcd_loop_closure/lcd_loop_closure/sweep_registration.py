@@ -1,0 +1,198 @@
+"""Register sweeps against the local map of the ones before, and notice when one does not fit."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lcd_common import se3
+from lcd_common.cloud import PointCloud
+from lcd_common.errors import ConfigError, DataError
+from lcd_common.se3 import Array
+from lcd_loop_closure.kiss_registration import KissRegistration
+from lcd_loop_closure.odometry_config import OdometryConfig
+from lcd_loop_closure.surface_alignment import SurfaceMatches, match_surfaces, polish
+from lcd_loop_closure.voxel_gaussians import VoxelGaussians
+from lcd_loop_closure.yaw_search import yaw_candidates
+
+_SAMPLE = 1000  # points of a sweep that are matched with surfaces
+_RECENT = 20  # sweeps whose fitness says what is usual
+_HEADINGS = 4  # that are tried by registration after a search
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep ready to be registered, in the lidar's frame at the middle of its time.
+
+    Attributes:
+        points: [N x 3] float64, all in range.
+        dense, source: [. x 3] thinned for the map and for KISS-ICP.
+        sample: [. x 3] the points that are matched with surfaces.
+        middle_s: the middle, seconds after the sweep's stamp.
+        timed: whether the points carried their time and the motion was undone.
+    """
+
+    points: Array
+    dense: Array
+    source: Array
+    sample: Array
+    middle_s: float
+    timed: bool
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a sweep lies in the map.
+
+    Attributes:
+        T_odom_middle: pose of the lidar in the middle of the sweep.
+        disagreement: [6] twist from KISS-ICP's pose to that on the surfaces.
+        matches: with the surfaces, at the pose.
+        healthy, recovered, reason: as of OdometryEstimate.
+    """
+
+    T_odom_middle: Array
+    disagreement: Array
+    matches: SurfaceMatches
+    healthy: bool = True
+    recovered: bool = False
+    reason: str = ''
+
+
+class SweepRegistration:
+    """Hold the local map: KISS-ICP's points and, beside them, their surfaces."""
+
+    def __init__(self, settings: OdometryConfig) -> None:
+        """Start with an empty map.
+
+        Raises:
+            ConfigError: min_range is not below max_range.
+        """
+        if settings.min_range >= settings.max_range:
+            raise ConfigError(
+                f'min_range must be below max_range = {settings.max_range:g} m, '
+                f'got {settings.min_range:g} m'
+            )
+        self.settings = settings
+        self.voxel_size = settings.voxel_size or settings.max_range / 100.0
+        self._kiss = KissRegistration(
+            settings.max_range, settings.min_range, self.voxel_size, settings.threads
+        )
+        self._surfaces = VoxelGaussians(self.voxel_size, settings.max_range)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the map."""
+        self._kiss.clear()
+        self._surfaces.clear()
+        self._fitness: deque[float] = deque(maxlen=_RECENT)
+        self.sweeps = 0
+
+    def points(self) -> Array:
+        """Return the points [N x 3] of the map, odom frame."""
+        return self._kiss.points()
+
+    def prepare(self, cloud: PointCloud, twist: Array) -> Sweep:
+        """Undo the motion within a sweep and thin it out.
+
+        Args:
+            cloud: in the lidar's frame.
+            twist: [6] motion of the lidar in the middle of the sweep, m/s and rad/s.
+
+        Raises:
+            DataError: too few points are usable.
+        """
+        cloud = cloud.finite()
+        time_s = cloud.time_s if self.settings.deskew else None
+        begin = end = 0.0
+        if time_s is not None and len(time_s):
+            begin, end = float(time_s.min()), float(time_s.max())
+        timed = end > begin
+        # KISS-ICP moves all points to the instant of the last one; a wrong motion harms least when
+        # they are taken at the middle.
+        points = self._kiss.preprocess(
+            cloud.xyz.astype(np.float64),
+            time_s.astype(np.float64) if time_s is not None and timed else None,
+            se3.exp(twist * (end - begin)),
+        )
+        if len(points) < self.settings.min_points:
+            raise DataError(
+                f'a sweep needs {self.settings.min_points} finite points between '
+                f'{self.settings.min_range:g} and {self.settings.max_range:g} m, got {len(points)}'
+            )
+        if timed:
+            half = se3.exp(twist * 0.5 * (end - begin))
+            points = np.asarray(se3.transform_points(half, points), np.float64)
+        dense, source = self._kiss.downsample(points)
+        chosen = np.linspace(0, len(source) - 1, min(_SAMPLE, len(source))).astype(int)
+        return Sweep(points, dense, source, source[chosen], 0.5 * (begin + end), timed)
+
+    def fit(self, sweep: Sweep, guess: Array, prior: Array, reach: float = 1.0) -> Fit:
+        """Register a sweep from one guess.
+
+        Args:
+            sweep: what to register.
+            guess: T_odom_middle to start from.
+            prior: 6x6 information that keeps what the sweep does not tell.
+            reach: widens the distance at which KISS-ICP looks for matches.
+        """
+        noise = self.settings.range_noise
+        T_kiss = self._kiss.align(sweep.source, guess, reach)
+        T_polished = polish(sweep.sample, T_kiss, self._surfaces, noise, prior)
+        T = T_polished if self.settings.polish else T_kiss
+        matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
+        return Fit(T, se3.log(se3.inverse(T_kiss) @ T_polished), matches)
+
+    def polished(self, sweep: Sweep, fit: Fit, prior: Array) -> Fit:
+        """Move a fit onto the surfaces with a sweep that was prepared anew."""
+        noise = self.settings.range_noise
+        T = polish(sweep.sample, fit.T_odom_middle, self._surfaces, noise, prior)
+        matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
+        return replace(fit, T_odom_middle=T, matches=matches)
+
+    def guarded(
+        self, cloud: PointCloud, sweep: Sweep, T_odom_last: Array, guess: Array, prior: Array
+    ) -> tuple[Sweep, Fit]:
+        """Register a sweep; when it fits badly, search its heading before giving up.
+
+        Returns:
+            The sweep, which may have been prepared anew, and its fit: recovered by the search, or
+            not healthy.
+        """
+        fit = self.fit(sweep, guess, prior)
+        usual = float(np.median(self._fitness)) if self._fitness else 0.0
+        limit = max(self.settings.min_fitness, self.settings.min_fitness_ratio * usual)
+        if fit.matches.fitness >= limit:
+            return sweep, fit
+        reason = f'{fit.matches.fitness:.0%} of the points fit the map, usual are {usual:.0%}'
+        centres = [T_odom_last, guess]
+        tried = [(sweep, fit), *self._search(sweep, centres, prior)]
+        if sweep.timed:  # deskewed by a motion that may have ended
+            tried += self._search(self.prepare(cloud, np.zeros(6)), centres, prior)
+        best_sweep, best = max(tried, key=lambda one: one[1].matches.fitness)
+        if best.matches.fitness < limit:
+            return best_sweep, replace(best, reason=reason, healthy=False)
+        reason += f'; found by a search over headings ({best.matches.fitness:.0%})'
+        return best_sweep, replace(best, reason=reason, recovered=True)
+
+    def start(self, sweep: Sweep, T_odom_middle: Array) -> None:
+        """Make a sweep the first of an empty map."""
+        self._kiss.add(sweep.dense, T_odom_middle)
+        # All points: the surfaces of one thinned sweep are too few to register the next one well.
+        self._add_surfaces(sweep.points, T_odom_middle)
+
+    def accept(self, sweep: Sweep, fit: Fit, guess: Array) -> None:
+        """Let a well registered sweep into the map."""
+        if not fit.recovered:  # a search says nothing about how well motions are guessed
+            self._kiss.note_deviation(guess, fit.T_odom_middle)
+        self._kiss.add(sweep.dense, fit.T_odom_middle)
+        self._add_surfaces(sweep.dense, fit.T_odom_middle)
+        self._fitness.append(fit.matches.fitness)
+
+    def _add_surfaces(self, points: Array, T: Array) -> None:
+        self._surfaces.add(np.asarray(se3.transform_points(T, points)), T[:3, 3])
+        self.sweeps += 1
+
+    def _search(self, sweep: Sweep, centres: list[Array], prior: Array) -> list[tuple[Sweep, Fit]]:
+        poses = yaw_candidates(sweep.sample, centres, self._surfaces, _HEADINGS)
+        return [(sweep, self.fit(sweep, T, prior, reach=2.0)) for T in poses]
