@@ -1,6 +1,7 @@
 """Write the nodes' parameter files from the settings that the nodes declare.
 
     python tools/parameter_files.py          writes lcd_loop_closure/config/*.yaml
+                                             and the tables of lcd_loop_closure/README.md
     python tools/parameter_files.py --check  says which of them are out of date
 
 A setting's default, meaning and unit stand in the code alone; this keeps the files true to it.
@@ -18,29 +19,37 @@ from lcd_common.settings import describe
 from lcd_loop_closure.graph_settings import GraphSettings
 from lcd_loop_closure.imu_preintegration import ImuConfig
 from lcd_loop_closure.keyframes import KeyframeConfig
+from lcd_loop_closure.lidar_odometry import OdometryConfig
 from lcd_loop_closure.loop_detector import LoopDetectorSettings
 from lcd_loop_closure.map_cloud import MapCloudConfig
+from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNodeConfig
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNodeConfig
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNodeConfig
 from lcd_loop_closure.online_map import OnlineMapConfig
 from lcd_loop_closure.robust_solver import RobustSolverConfig
 from lcd_loop_closure.session_anchor import AnchorConfig
 
-CONFIG = Path(__file__).resolve().parents[1] / 'lcd_loop_closure' / 'config'
+PACKAGE = Path(__file__).resolve().parents[1] / 'lcd_loop_closure'
+CONFIG, README = PACKAGE / 'config', PACKAGE / 'README.md'
 _COMMENT_AT = 44
 
 
 def parameter_files() -> dict[Path, str]:
-    """Return every parameter file's path and what it must hold."""
+    """Return every parameter file's path and what it must hold, and the README's."""
+    files = {CONFIG / f'{node}.yaml': _file(node, *parts) for node, parts in _nodes().items()}
+    return {**files, README: _readme(README.read_text())}
+
+
+def _nodes() -> dict[str, tuple[tuple[type, ...], dict[str, type]]]:
+    """Return each node's settings: those without a prefix, and the groups."""
     return {
-        CONFIG / 'loop_closure.yaml': _file(
-            'loop_closure',
-            LoopClosureNodeConfig,
+        'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),
+        'loop_closure': (
+            (LoopClosureNodeConfig,),
             {'keyframes': KeyframeConfig, **_groups(LoopDetectorSettings())},
         ),
-        CONFIG / 'pose_graph.yaml': _file(
-            'pose_graph',
-            PoseGraphNodeConfig,
+        'pose_graph': (
+            (PoseGraphNodeConfig,),
             {
                 **_groups(GraphSettings()),
                 'imu': ImuConfig,
@@ -57,13 +66,38 @@ def _groups(settings: Any) -> dict[str, type]:
     return {f.name: type(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
 
 
-def _file(node: str, top: type, groups: dict[str, type]) -> str:
+def _readme(text: str) -> str:
+    """Return the README with the parameters between its markers."""
+    for node, (tops, groups) in _nodes().items():
+        begin = f'<!-- parameters:{node} -->'
+        before, found, rest = text.partition(begin)
+        if not found or '<!-- end -->' not in rest:
+            raise SystemExit(f'error: {README.name} has no {begin} ... <!-- end -->')
+        table = [
+            '',
+            '',
+            '| parameter | default | unit | range | meaning |',
+            '|---|---|---|---|---|',
+        ]
+        for prefix, cls in [*(('', top) for top in tops), *((f'{g}.', groups[g]) for g in groups)]:
+            table += [_table_row(prefix, *row) for row in describe(cls)]
+        text = before + begin + '\n'.join(table) + '\n\n' + rest[rest.index('<!-- end -->') :]
+    return text
+
+
+def _table_row(prefix: str, name: str, default: str, unit: str, bounds: str, meaning: str) -> str:
+    value = _yaml(ast.literal_eval(default))
+    allowed = ', '.join(bounds.split(' | '))
+    return f'| `{prefix}{name}` | `{value}` | {unit} | {allowed} | {meaning} |'
+
+
+def _file(node: str, tops: tuple[type, ...], groups: dict[str, type]) -> str:
     lines = [
         f'# Parameters of {node} with their defaults; keep the lines that you change.',
         '# Written by tools/parameter_files.py.',
         f'/**/{node}:',
         '  ros__parameters:',
-        *_rows(top, '    '),
+        *(row for top in tops for row in _rows(top, '    ')),
     ]
     for name, cls in groups.items():
         meaning = (cls.__doc__ or '').strip().splitlines()[0]

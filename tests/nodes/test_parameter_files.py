@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 pytest.importorskip('rclpy')
+from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
 
@@ -24,9 +25,15 @@ def test_they_are_up_to_date() -> None:
     assert stale == [], 'run python tools/parameter_files.py'
 
 
-@pytest.mark.parametrize('cls', [LoopClosureNode, PoseGraphNode])
-def test_ros_reads_every_default_from_them(make: Callable[..., Any], cls: Any) -> None:
-    name = 'loop_closure' if cls is LoopClosureNode else 'pose_graph'
+@pytest.mark.parametrize(
+    ('name', 'cls'),
+    [
+        ('lidar_odometry', LidarOdometryNode),
+        ('loop_closure', LoopClosureNode),
+        ('pose_graph', PoseGraphNode),
+    ],
+)
+def test_ros_reads_every_default_from_them(make: Callable[..., Any], name: str, cls: Any) -> None:
     file = CONFIG / f'{name}.yaml'
     plain = make(cls)
     # What stands in the file is read: not one parameter is left to its default in the code.
