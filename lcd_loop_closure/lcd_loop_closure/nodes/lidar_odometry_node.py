@@ -138,7 +138,7 @@ class LidarOdometryNode(Node):
             with self.diagnostics.stage('convert'):
                 cloud = messages.cloud_from_message(scan.points)
                 finite = cloud.finite()
-            with self.diagnostics.stage('register'):
+            with self.diagnostics.stage('registration'):
                 estimate = self._odometry.register(finite, stamp_ns)
         except DataError as error:
             self._reject('unusable cloud', str(error))
