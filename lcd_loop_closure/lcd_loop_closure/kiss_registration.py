@@ -17,6 +17,8 @@ from kiss_icp.voxelization import voxel_down_sample
 from lcd_common import se3
 from lcd_common.se3 import Array
 
+_ROUGH_ITERATIONS = 30
+
 
 class KissRegistration:
     """KISS-ICP (Vizzo et al., RA-L 2023), as its `KissICP.register_frame` puts it together.
@@ -25,9 +27,16 @@ class KissRegistration:
     """
 
     def __init__(
-        self, max_range: float, min_range: float, voxel_size: float, max_num_threads: int
+        self,
+        max_range: float,
+        min_range: float,
+        voxel_size: float,
+        max_num_threads: int,
+        convergence: float = 1e-4,
     ) -> None:
         """Start with an empty map; lengths in metres, 0 threads are all.
+
+        Registration ends with a step smaller than `convergence` (norm of metres and radians).
 
         The number of threads belongs to the process: KISS-ICP keeps that of its first user.
         """
@@ -35,11 +44,16 @@ class KissRegistration:
         self._config = KISSConfig(
             data=DataConfig(max_range=max_range, min_range=min_range, deskew=True),
             mapping=MappingConfig(voxel_size=voxel_size),
-            registration=RegistrationConfig(max_num_threads=max_num_threads),
+            registration=RegistrationConfig(
+                max_num_threads=max_num_threads, convergence_criterion=convergence
+            ),
             adaptive_threshold=AdaptiveThresholdConfig(),
         )
         self._preprocessor = get_preprocessor(self._config)
         self._registration = get_registration(self._config)
+        rough = self._config.model_copy(deep=True)
+        rough.registration.max_num_iterations = _ROUGH_ITERATIONS
+        self._rough_registration = get_registration(rough)
         self.clear()
 
     def clear(self) -> None:
@@ -64,10 +78,15 @@ class KissRegistration:
         dense = voxel_down_sample(xyz, 0.5 * voxel_size)
         return dense, voxel_down_sample(dense, 1.5 * voxel_size)
 
-    def align(self, source: Array, T_map_guess: Array, reach: float = 1.0) -> Array:
-        """Return the pose T_map_lidar; `reach` widens the distance that matches may have."""
-        sigma = reach * self._threshold.get_threshold()
-        T_map_lidar: Array = self._registration.align_points_to_map(
+    def align(self, source: Array, T_map_guess: Array, *, rough: bool = False) -> Array:
+        """Return the pose T_map_lidar.
+
+        Roughly is from a guess that may be far off or wrong: with twice the distance that matches
+        may have, and few iterations, as what does not fit would go on for seconds.
+        """
+        sigma = (2.0 if rough else 1.0) * self._threshold.get_threshold()
+        registration = self._rough_registration if rough else self._registration
+        T_map_lidar: Array = registration.align_points_to_map(
             points=source,
             voxel_map=self._map,
             initial_guess=T_map_guess,

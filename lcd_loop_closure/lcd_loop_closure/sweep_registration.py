@@ -127,17 +127,17 @@ class SweepRegistration:
         chosen = np.linspace(0, len(source) - 1, min(_SAMPLE, len(source))).astype(int)
         return Sweep(points, dense, source, source[chosen], 0.5 * (begin + end), timed)
 
-    def fit(self, sweep: Sweep, guess: Array, prior: Array, reach: float = 1.0) -> Fit:
+    def fit(self, sweep: Sweep, guess: Array, prior: Array, *, rough: bool = False) -> Fit:
         """Register a sweep from one guess.
 
         Args:
             sweep: what to register.
             guess: T_odom_middle to start from.
             prior: 6x6 information that keeps what the sweep does not tell.
-            reach: widens the distance at which KISS-ICP looks for matches.
+            rough: for a guess that may be far off or wrong.
         """
         noise = self.settings.range_noise
-        T_kiss = self._kiss.align(sweep.source, guess, reach)
+        T_kiss = self._kiss.align(sweep.source, guess, rough=rough)
         T_polished = polish(sweep.sample, T_kiss, self._surfaces, noise, prior)
         T = T_polished if self.settings.polish else T_kiss
         matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
@@ -170,6 +170,8 @@ class SweepRegistration:
         if sweep.timed:  # deskewed by a motion that may have ended
             tried += self._search(self.prepare(cloud, np.zeros(6)), centres, prior)
         best_sweep, best = max(tried, key=lambda one: one[1].matches.fitness)
+        if best is not fit and best.matches.fitness >= limit:
+            best = self.fit(best_sweep, best.T_odom_middle, prior)
         if best.matches.fitness < limit:
             return best_sweep, replace(best, reason=reason, healthy=False)
         reason += f'; found by a search over headings ({best.matches.fitness:.0%})'
@@ -195,4 +197,4 @@ class SweepRegistration:
 
     def _search(self, sweep: Sweep, centres: list[Array], prior: Array) -> list[tuple[Sweep, Fit]]:
         poses = yaw_candidates(sweep.sample, centres, self._surfaces, _HEADINGS)
-        return [(sweep, self.fit(sweep, T, prior, reach=2.0)) for T in poses]
+        return [(sweep, self.fit(sweep, T, prior, rough=True)) for T in poses]

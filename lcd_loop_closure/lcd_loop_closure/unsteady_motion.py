@@ -44,11 +44,12 @@ class UnsteadyMotion:
         With `a` the change of the motion between two steps and `j` the change of that: points tell
         the pose on average over the sweep's time, which an acceleration moves by a/24; it was
         undone with a twist that was off by j/3, so by j/10 root mean square over the sweep; and
-        from the middle to a stamp half a step away a constant acceleration leaves j/16 (constant
-        speed: a/8).
+        the way to the stamp, a share s of a step, is a polynomial through the last poses, whose
+        remainder is s(1-s)(2-s)/6 j for constant acceleration and s(1-s)/2 a for constant speed.
         """
         jerk = change - self._change
-        to_stamp = (jerk / 16.0 if self.steady else change / 8.0) * float(share != 0.0)
+        remainder = 0.5 * share * (1.0 - share)
+        to_stamp = (2.0 - share) / 3.0 * remainder * jerk if self.steady else remainder * change
         parts = np.stack([change / 24.0, jerk / 10.0, to_stamp])
         now = parts.T @ parts
         self._usual = _MEMORY * self._usual + (1.0 - _MEMORY) * now
