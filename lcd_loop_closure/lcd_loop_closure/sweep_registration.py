@@ -76,7 +76,12 @@ class SweepRegistration:
         self.settings = settings
         self.voxel_size = settings.voxel_size or settings.max_range / 100.0
         self._kiss = KissRegistration(
-            settings.max_range, settings.min_range, self.voxel_size, settings.threads
+            settings.max_range,
+            settings.min_range,
+            self.voxel_size,
+            settings.threads,
+            # From a centimetre away the polish goes on, in fewer and cheaper steps.
+            convergence=1e-2 if settings.polish else 1e-4,
         )
         self._surfaces = VoxelGaussians(self.voxel_size, settings.max_range)
         self.clear()
