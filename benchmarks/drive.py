@@ -2,6 +2,8 @@
 
     python -m benchmarks.drive                      everything (about an hour on two cores)
     python -m benchmarks.drive --only u_turn peers  some sections; the others keep their figures
+    python -m benchmarks.drive --quick              shorter: 15 minutes of replay instead of an hour,
+                                                    every tenth sweep across data sets, one U-turn
     python -m benchmarks.drive --list               the sections and what they measure
 
 Exits with 1 when a section failed or a required figure is missing.
@@ -12,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,22 +49,34 @@ REQUIRED = (
 Section = Callable[[Path], dict[str, Any]]
 
 
-def sections() -> dict[str, tuple[str, Section]]:
+def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
     """Return every section by name: what it measures, and the function that does."""
     # Imported here: --help and --list need none of it.
     from benchmarks import drives, false_loops, graph_update, loop_pairs, memory, odometry
 
     return {
         'kitti_08': ('revisits of the thesis counted on KITTI 08', loop_pairs.count_kitti_08),
-        'kitti_00': ('one true and many false pairs of real scans', loop_pairs.evaluate),
+        'kitti_00': (
+            'one true and many false pairs of real scans',
+            partial(loop_pairs.evaluate, sweep_step=10) if quick else loop_pairs.evaluate,
+        ),
         'odometry': ('consistency of the odometry covariance in simulation', odometry.evaluate),
-        'false_loops': ('wrong loops added to known graphs', false_loops.evaluate),
+        'false_loops': (
+            'wrong loops added to known graphs',
+            partial(false_loops.evaluate, seeds=1, town_seeds=3) if quick else false_loops.evaluate,
+        ),
         'graph_update': ('one update among 10,000 keyframes', graph_update.evaluate),
         'out_and_back': ('real sweeps at 1x through DDS', drives.out_and_back_live),
         'lockstep': ('the same sweeps in lock-step', drives.out_and_back_lockstep),
-        'u_turn': ('a turn that breaks odometry, beside KISS-SLAM', drives.u_turn),
+        'u_turn': (
+            'a turn that breaks odometry, beside KISS-SLAM',
+            partial(drives.u_turn, towns=1) if quick else drives.u_turn,
+        ),
         'peers': ('the same folders through KISS-SLAM', drives.side_by_side),
-        'memory': ('an hour of replay', memory.evaluate),
+        'memory': (
+            'an hour of replay',
+            partial(memory.evaluate, recorded_s=900.0) if quick else memory.evaluate,
+        ),
     }
 
 
@@ -74,13 +89,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument('--only', nargs='+', metavar='SECTION', help='measure only these')
     parser.add_argument('--list', action='store_true', help='list the sections and stop')
+    parser.add_argument(
+        '--quick', action='store_true', help='shorter, and marked so in the results'
+    )
     parser.add_argument('--work', type=Path, help='folder for intermediate files, kept')
     arguments = parser.parse_args(argv)
     return run(lambda: _run(arguments))
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    known = sections()
+    known = sections(arguments.quick)
     if arguments.list:
         for name, (text, _) in known.items():
             print(f'{name:<14}{text}')
@@ -92,7 +110,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory(prefix='drive_benchmark_') as temporary:
         work = arguments.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
-        failures = measure({name: known[name][1] for name in chosen}, work)
+        failures = measure({name: known[name][1] for name in chosen}, work, arguments.quick)
     figures = report.read('drive')
     report.print_table(figures)
     absent = report.missing(figures, REQUIRED)
@@ -103,7 +121,7 @@ def _run(arguments: argparse.Namespace) -> int:
     return 1 if failures or absent else 0
 
 
-def measure(chosen: dict[str, Section], work: Path) -> dict[str, str]:
+def measure(chosen: dict[str, Section], work: Path, quick: bool = False) -> dict[str, str]:
     """Run sections one by one, keeping each one's figures at once; return what failed, and why."""
     failures = {}
     for number, (name, section) in enumerate(chosen.items(), start=1):
@@ -116,7 +134,7 @@ def measure(chosen: dict[str, Section], work: Path) -> dict[str, str]:
             continue
         seconds = time.perf_counter() - start
         figures = _placed(report.read('drive'), name, new)
-        measured = {**report.provenance(), 'seconds': round(seconds, 1)}
+        measured = {**report.provenance(), 'seconds': round(seconds, 1), 'quick': quick}
         figures['measured'] = {**figures.get('measured', {}), name: measured}
         report.write('drive', figures)
     return failures

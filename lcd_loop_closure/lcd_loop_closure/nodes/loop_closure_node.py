@@ -64,7 +64,7 @@ class LoopClosureNodeConfig:
         'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
     )
     niceness: int = setting(
-        5, 'lower priority of the process when it runs alone: odometry goes first', low=0, high=19
+        10, 'lower priority of the process when it runs alone: odometry goes first', low=0, high=19
     )
     threaded: bool = setting(True, 'work beside the callbacks; false: inside, for lock-step replay')
 

@@ -86,7 +86,7 @@ class PoseGraphNodeConfig:
         'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
     )
     solver_niceness: int = setting(
-        5, 'lower priority of the process that judges the loops', low=0, high=19
+        10, 'lower priority of the process that judges the loops', low=0, high=19
     )
     threaded: bool = setting(True, 'work beside the callbacks; false: inside, for lock-step replay')
 
