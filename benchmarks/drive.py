@@ -2,7 +2,7 @@
 
     python -m benchmarks.drive                      everything (about an hour on two cores)
     python -m benchmarks.drive --only u_turn peers  some sections; the others keep their figures
-    python -m benchmarks.drive --quick              shorter: 15 minutes of replay instead of an hour,
+    python -m benchmarks.drive --quick              shorter: a quarter of an hour of replay,
                                                     every tenth sweep across data sets, one U-turn
     python -m benchmarks.drive --list               the sections and what they measure
 

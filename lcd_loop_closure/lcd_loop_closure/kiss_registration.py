@@ -18,6 +18,8 @@ from lcd_common import se3
 from lcd_common.se3 import Array
 
 _ROUGH_ITERATIONS = 30
+# Norm of the last step, metres and radians; KISS-ICP's own is 1e-4.
+_BRIEF_CONVERGENCE = 1e-2
 
 
 class KissRegistration:
@@ -27,16 +29,9 @@ class KissRegistration:
     """
 
     def __init__(
-        self,
-        max_range: float,
-        min_range: float,
-        voxel_size: float,
-        max_num_threads: int,
-        convergence: float = 1e-4,
+        self, max_range: float, min_range: float, voxel_size: float, max_num_threads: int
     ) -> None:
         """Start with an empty map; lengths in metres, 0 threads are all.
-
-        Registration ends with a step smaller than `convergence` (norm of metres and radians).
 
         The number of threads belongs to the process: KISS-ICP keeps that of its first user.
         """
@@ -44,9 +39,7 @@ class KissRegistration:
         self._config = KISSConfig(
             data=DataConfig(max_range=max_range, min_range=min_range, deskew=True),
             mapping=MappingConfig(voxel_size=voxel_size),
-            registration=RegistrationConfig(
-                max_num_threads=max_num_threads, convergence_criterion=convergence
-            ),
+            registration=RegistrationConfig(max_num_threads=max_num_threads),
             adaptive_threshold=AdaptiveThresholdConfig(),
         )
         self._preprocessor = get_preprocessor(self._config)
@@ -54,6 +47,9 @@ class KissRegistration:
         rough = self._config.model_copy(deep=True)
         rough.registration.max_num_iterations = _ROUGH_ITERATIONS
         self._rough_registration = get_registration(rough)
+        brief = self._config.model_copy(deep=True)
+        brief.registration.convergence_criterion = _BRIEF_CONVERGENCE
+        self._brief_registration = get_registration(brief)
         self.clear()
 
     def clear(self) -> None:
@@ -78,14 +74,19 @@ class KissRegistration:
         dense = voxel_down_sample(xyz, 0.5 * voxel_size)
         return dense, voxel_down_sample(dense, 1.5 * voxel_size)
 
-    def align(self, source: Array, T_map_guess: Array, *, rough: bool = False) -> Array:
+    def align(
+        self, source: Array, T_map_guess: Array, *, rough: bool = False, brief: bool = False
+    ) -> Array:
         """Return the pose T_map_lidar.
+
+        Briefly is to end a centimetre before KISS-ICP would, for somebody who goes on from there.
 
         Roughly is from a guess that may be far off or wrong: with twice the distance that matches
         may have, and few iterations, as what does not fit would go on for seconds.
         """
         sigma = (2.0 if rough else 1.0) * self._threshold.get_threshold()
-        registration = self._rough_registration if rough else self._registration
+        registration = self._brief_registration if brief else self._registration
+        registration = self._rough_registration if rough else registration
         T_map_lidar: Array = registration.align_points_to_map(
             points=source,
             voxel_map=self._map,

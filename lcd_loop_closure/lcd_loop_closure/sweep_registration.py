@@ -17,6 +17,9 @@ from lcd_loop_closure.yaw_search import yaw_candidates
 
 _SAMPLE = 1000  # points of a sweep that are matched with surfaces
 _RECENT = 20  # sweeps whose fitness says what is usual
+_AS_USUAL = 0.9  # share of the usual fitness that a brief registration must reach
+_DOUBTFUL = 0.75  # of the usual fitness: less is worth a search
+_BETTER = 1.1  # times the fitness that a search must find to be believed
 _HEADINGS = 4  # that are tried by registration after a search
 
 
@@ -76,12 +79,7 @@ class SweepRegistration:
         self.settings = settings
         self.voxel_size = settings.voxel_size or settings.max_range / 100.0
         self._kiss = KissRegistration(
-            settings.max_range,
-            settings.min_range,
-            self.voxel_size,
-            settings.threads,
-            # From a centimetre away the polish goes on, in fewer and cheaper steps.
-            convergence=1e-2 if settings.polish else 1e-4,
+            settings.max_range, settings.min_range, self.voxel_size, settings.threads
         )
         self._surfaces = VoxelGaussians(self.voxel_size, settings.max_range)
         self.clear()
@@ -132,7 +130,15 @@ class SweepRegistration:
         chosen = np.linspace(0, len(source) - 1, min(_SAMPLE, len(source))).astype(int)
         return Sweep(points, dense, source, source[chosen], 0.5 * (begin + end), timed)
 
-    def fit(self, sweep: Sweep, guess: Array, prior: Array, *, rough: bool = False) -> Fit:
+    def fit(
+        self,
+        sweep: Sweep,
+        guess: Array,
+        prior: Array,
+        *,
+        rough: bool = False,
+        brief: bool = False,
+    ) -> Fit:
         """Register a sweep from one guess.
 
         Args:
@@ -140,9 +146,10 @@ class SweepRegistration:
             guess: T_odom_middle to start from.
             prior: 6x6 information that keeps what the sweep does not tell.
             rough: for a guess that may be far off or wrong.
+            brief: leave the last centimetre to the polish, which is faster at it.
         """
         noise = self.settings.range_noise
-        T_kiss = self._kiss.align(sweep.source, guess, rough=rough)
+        T_kiss = self._kiss.align(sweep.source, guess, rough=rough, brief=brief)
         T_polished = polish(sweep.sample, T_kiss, self._surfaces, noise, prior)
         T = T_polished if self.settings.polish else T_kiss
         matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
@@ -162,25 +169,26 @@ class SweepRegistration:
 
         Returns:
             The sweep, which may have been prepared anew, and its fit: recovered by the search, or
-            not healthy.
+            not healthy; then its pose is the guess.
         """
         fit = self.fit(sweep, guess, prior)
         usual = float(np.median(self._fitness)) if self._fitness else 0.0
         limit = max(self.settings.min_fitness, self.settings.min_fitness_ratio * usual)
-        if fit.matches.fitness >= limit:
+        if fit.matches.fitness >= max(limit, _DOUBTFUL * usual):
             return sweep, fit
         reason = f'{fit.matches.fitness:.0%} of the points fit the map, usual are {usual:.0%}'
         centres = [T_odom_last, guess]
-        tried = [(sweep, fit), *self._search(sweep, centres, prior)]
+        tried = self._search(sweep, centres, prior)
         if sweep.timed:  # deskewed by a motion that may have ended
             tried += self._search(self.prepare(cloud, np.zeros(6)), centres, prior)
-        best_sweep, best = max(tried, key=lambda one: one[1].matches.fitness)
-        if best is not fit and best.matches.fitness >= limit:
-            best = self.fit(best_sweep, best.T_odom_middle, prior)
-        if best.matches.fitness < limit:
-            return best_sweep, replace(best, reason=reason, healthy=False)
-        reason += f'; found by a search over headings ({best.matches.fitness:.0%})'
-        return best_sweep, replace(best, reason=reason, recovered=True)
+        found_sweep, found = max(tried, key=lambda one: one[1].matches.fitness)
+        if found.matches.fitness > max(limit, _BETTER * fit.matches.fitness):
+            found = self.fit(found_sweep, found.T_odom_middle, prior)
+            reason += f'; found by a search over headings ({found.matches.fitness:.0%})'
+            return found_sweep, replace(found, reason=reason, recovered=True)
+        if fit.matches.fitness >= limit:
+            return sweep, fit
+        return sweep, replace(fit, T_odom_middle=guess, reason=reason, healthy=False)
 
     def start(self, sweep: Sweep, T_odom_middle: Array) -> None:
         """Make a sweep the first of an empty map."""
