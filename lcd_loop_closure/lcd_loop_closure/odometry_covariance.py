@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common.se3 import Array
-from lcd_loop_closure.surface_alignment import SurfaceMatches
+from lcd_loop_closure.surface_alignment import SurfaceMatches, held_information
 
 # A third of the noise per sweep keeps the sum over 2 to 18 sweeps within a factor of 3 of 2 P.
 _CHAINED = 1.0 / 3.0
@@ -58,9 +58,8 @@ def motion_covariance(
         cell_size: edge of the cells in which residuals are taken for dependent, metres.
         renewed: share of the surface sampling that is new since the last sweep.
     """
-    J, w = matches.jacobian, matches.weight
-    weighted = J * w[:, None]
-    information = _positive(J.T @ weighted - matches.information_bias)
+    information, held = held_information(matches)
+    weighted = matches.jacobian * matches.weight[:, None] @ held
     cells = np.floor(points[matches.point] / cell_size).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     count = int(cell.max()) + 1 if len(cell) else 0
@@ -77,12 +76,6 @@ def motion_covariance(
 def _around(inverse: NDArray[np.floating], middle: NDArray[np.floating]) -> Array:
     covariance = inverse @ middle @ inverse
     return np.asarray(0.5 * (covariance + covariance.T))
-
-
-def _positive(matrix: Array) -> Array:
-    """Return the nearest positive semi-definite matrix."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def lost_covariance(translation: float, heading: float) -> MotionCovariance:

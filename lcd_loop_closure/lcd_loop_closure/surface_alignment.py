@@ -15,6 +15,8 @@ _STEEP = 0.7  # cosine of 45 degrees
 _FLOOR_M = 0.002  # quantisation of ranges and angles; keeps weights finite
 _ROUNDS = 12  # Gauss-Newton steps at most; each looks up its voxels afresh. Three are usual
 _CONVERGED_M, _CONVERGED_RAD = 5e-4, 5e-5
+_REACH = (0.4, 0.15)  # voxels, in the first rounds
+_HELD = 0.5  # share of a direction's information that must be more than noise of the normals
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,11 @@ class SurfaceMatches:
 
 
 def match_surfaces(
-    points: Array, T_map_lidar: Array, surfaces: VoxelGaussians, range_noise: float
+    points: Array,
+    T_map_lidar: Array,
+    surfaces: VoxelGaussians,
+    range_noise: float,
+    reach: float = 0.0,
 ) -> SurfaceMatches:
     """Measure points against the map's surfaces.
 
@@ -61,6 +67,7 @@ def match_surfaces(
         T_map_lidar: pose of the lidar.
         surfaces: the map.
         range_noise: standard deviation of a range, metres.
+        reach: residuals up to here are no outliers, metres.
     """
     R = T_map_lidar[:3, :3]
     placed = points @ R.T + T_map_lidar[:3, 3]
@@ -89,7 +96,8 @@ def match_surfaces(
     scaled = np.abs(residual) / np.sqrt(spread)
     # Geman-McClure as in KISS-ICP, at three times the typical residual.
     scale = 3.0 * max(1.4826 * float(np.median(scaled)) if len(scaled) else 1.0, 0.5)
-    weight = 1.0 / spread / (1.0 + (scaled / scale) ** 2) ** 2
+    width = np.maximum(scale * np.sqrt(spread), reach)
+    weight = 1.0 / spread / (1.0 + (residual / width) ** 2) ** 2
     jacobian = _jacobian(points[index[row]], normal @ R)
     near = slots >= 0
     near[index[row[np.abs(residual) > 3.0 * np.sqrt(spread)]]] = False
@@ -122,17 +130,48 @@ def polish(
         prior_information: 6x6; keeps the directions that the surfaces do not hold.
     """
     T = T_map_lidar
-    for _ in range(_ROUNDS):
-        matches = match_surfaces(points, T, surfaces, range_noise)
-        weighted = matches.jacobian * matches.weight[:, None]
-        information = matches.jacobian.T @ weighted + prior_information
+    for round_ in range(_ROUNDS):
+        # Most points lie on the ground and along the street, where a pose that is wrong along it
+        # fits: the few that tell must not be outliers from the first.
+        reach = _REACH[round_] * surfaces.voxel_size if round_ < len(_REACH) else 0.0
+        matches = match_surfaces(points, T, surfaces, range_noise, reach)
+        information, held = held_information(matches)
+        gradient = held.T @ matches.jacobian.T @ (matches.weight * matches.residual)
         away = se3.log(se3.inverse(T_map_lidar) @ T)
-        gradient = weighted.T @ matches.residual + prior_information @ away
-        step = -np.linalg.solve(information, gradient)
+        step = -np.linalg.solve(
+            information + prior_information, gradient + prior_information @ away
+        )
         T = T @ se3.exp(step)
+        if reach:
+            continue
         if np.linalg.norm(step[:3]) < _CONVERGED_M and np.linalg.norm(step[3:]) < _CONVERGED_RAD:
             break
     return T
+
+
+def held_information(matches: SurfaceMatches) -> tuple[Array, Array]:
+    """Return what the surfaces truly say about the pose.
+
+    Along a smooth corridor the normals' noise alone seems to hold the vehicle, and would move it.
+    Directions in which more than half of the information is such noise are left out (in spirit the
+    solution remapping of Zhang, Kaess and Singh, ICRA 2016).
+
+    Returns:
+        The information matrix 6x6, less the noise's share, and the 6x6 projection that takes
+        gradients to the directions that are held.
+    """
+    J, w = matches.jacobian, matches.weight
+    full = J.T @ (J * w[:, None])
+    # In the directions that simultaneously diagonalise `full` (to one) and the bias.
+    values, vectors = np.linalg.eigh(full)
+    values = np.maximum(values, 1e-12 * max(float(values[-1]), 1.0))
+    whiten = vectors / np.sqrt(values)
+    feigned, turn = np.linalg.eigh(whiten.T @ matches.information_bias @ whiten)
+    basis = whiten @ turn  # basis.T @ full @ basis is the identity
+    keep = feigned < 1.0 - _HELD
+    back = full @ basis  # the inverse transpose of the basis
+    information = (back[:, keep] * (1.0 - feigned[keep])) @ back[:, keep].T
+    return information, basis[:, keep] @ back[:, keep].T
 
 
 def _jacobian(points: Array, normal_lidar: Array) -> Array:

@@ -1,58 +1,70 @@
-"""Feed lidar_odometry by hand and compare it with the registration that it runs."""
+"""Feed lidar_odometry sweeps of a simulated street and read what it publishes."""
 
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
-import made_up_drive as drive
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import TransformStamped
+from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from bags.nodes.lockstep import LockStep
-from bags.street.drive import StreetDrive
-from bags.street.lidar import LidarConfig
+from bags.street import LidarConfig, Route, StreetConfig, StreetDrive
+from bags.street.drive import T_BASE_LIDAR as T_CAR_LIDAR
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError
-from lcd_common.nodes import messages, qos
-from lcd_loop_closure.lidar_odometry import LidarOdometry, OdometryConfig, OdometryEstimate
+from lcd_common.nodes import messages
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 
 pytestmark = pytest.mark.ros
 Make = Callable[..., Any]
-_START = 60  # sweep: the vehicle drives
+
+# The LiDAR of these tests looks back to the left, and leans.
+T_BASE_LIDAR = se3.from_rotation_translation(se3.so3_exp([0.05, 0.1, 2.2]), [0.4, -0.2, 1.6])
+
+
+@dataclass(frozen=True)
+class Sweep:
+    stamp_ns: int
+    cloud: PointCloud
+    T_world_base: np.ndarray
+
+    def message(self, **changes: Any) -> PointCloud2:
+        values = {'cloud': self.cloud, 'stamp': self.stamp_ns, 'frame_id': 'lidar', **changes}
+        return messages.cloud_message(**values)
 
 
 @cache
-def _street() -> StreetDrive:
-    return StreetDrive('loop', lidar=LidarConfig(columns=360))
+def sweeps() -> tuple[Sweep, ...]:
+    route = Route(speed=8.0).through([(0, 0), (30, 0), (30, 20)])
+    town = StreetDrive(route, StreetConfig(seed=2), LidarConfig(columns=360))
+    poses = town.truth().T_world_body
+    T_lidar_car = se3.inverse(T_BASE_LIDAR) @ T_CAR_LIDAR
+    scans = [(town.scan(i), i) for i in range(24, 34)]
+    return tuple(Sweep(s.stamp_ns, s.cloud.transformed(T_lidar_car), poses[i]) for s, i in scans)
 
 
-@cache
-def _cloud(step: int) -> PointCloud:
-    return _street().scan(_START + step).cloud
-
-
-def _sweep(step: int, stamp_ns: int | None = None) -> PointCloud2:
-    stamp = drive.stamp(step) if stamp_ns is None else stamp_ns
-    return messages.cloud_message(_cloud(step), stamp, 'lidar')
-
-
-@cache
-def _estimates(count: int) -> list[OdometryEstimate]:
-    """Run the registration itself."""
-    odometry = LidarOdometry(OdometryConfig(threads=1))
-    return [odometry.register(_cloud(k), drive.stamp(k)) for k in range(count)]
+def mounting(child: str = 'lidar') -> TFMessage:
+    stamped = TransformStamped(
+        header=messages.header(1, 'base_link'),
+        child_frame_id=child,
+        transform=messages.transform_message(T_BASE_LIDAR),
+    )
+    return TFMessage(transforms=[stamped])
 
 
 class Fed:
@@ -61,308 +73,252 @@ class Fed:
     def __init__(self, node: LidarOdometryNode, prefix: str = '/', transform: bool = True) -> None:
         self.node, self.prefix = node, prefix
         self.lockstep = LockStep([node])
-        self.odom: list[Odometry] = []
-        self.tf: list[TFMessage] = []
-        self.lockstep.listen(prefix + 'odom', lambda m: self.odom.append(m))
-        self.lockstep.listen('/tf', lambda m: self.tf.append(m))
+        self.odom: list[Any] = []
+        self.tf: list[Any] = []
+        self.lockstep.listen(prefix + 'odom', self.odom.append)
+        self.lockstep.listen('/tf', lambda m: self.tf.extend(m.transforms))
         if transform:
-            self.lockstep.feed('/tf_static', drive.static_transform())
+            self.lockstep.feed('/tf_static', mounting())
 
-    def take(self, *sweeps: PointCloud2) -> None:
-        """Feed sweeps."""
-        for sweep in sweeps:
-            self.lockstep.feed(self.prefix + 'points', sweep)
+    def feed(self, message: PointCloud2) -> None:
+        self.lockstep.feed(self.prefix + 'points', message)
 
     def counted(self, cause: str) -> int:
-        """Return a counter of the node."""
         return self.node.diagnostics.counted(cause)
 
-    def rejected(self) -> int:
-        """Return how many sweeps were rejected, whatever the cause."""
-        counts = self.node.diagnostics.counts()
-        return sum(n for cause, n in counts.items() if cause.startswith('rejected points: '))
-
-    def stamps(self) -> list[int]:
-        """Return the stamps of the odometry."""
-        return [messages.stamp_ns(m.header.stamp) for m in self.odom]
+    def poses(self) -> list[np.ndarray]:
+        return [messages.transform_from_pose(m.pose.pose) for m in self.odom]
 
 
-def _node(make: Make, **options: Any) -> Any:
-    return make(LidarOdometryNode, threaded=False, threads=1, **options)
+def test_the_base_is_followed_whatever_way_the_lidar_is_mounted(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    for sweep in sweeps():
+        fed.feed(sweep.message())
+    assert len(fed.odom) == len(sweeps())
+    np.testing.assert_allclose(fed.poses()[0], np.eye(4), atol=1e-12)
+    T_world_odom = sweeps()[0].T_world_base
+    for sweep, message, T in zip(sweeps(), fed.odom, fed.poses(), strict=True):
+        metres, radians = se3.distance(T_world_odom @ T, sweep.T_world_base)
+        assert metres < 0.1 and radians < 5e-3
+        assert messages.stamp_ns(message.header.stamp) == sweep.stamp_ns
+        assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
+    assert np.linalg.norm(fed.poses()[-1][:3, 3]) > 4.0
 
 
-def _pose(message: Odometry) -> tuple[se3.Array, se3.Array]:
-    T, covariance = messages.from_pose_with_covariance(message.pose)
-    assert covariance is not None
-    return T, covariance
-
-
-def test_it_follows_the_base_wherever_the_lidar_is_mounted(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(*(_sweep(k) for k in range(4)))
-    assert fed.stamps() == [drive.stamp(k) for k in range(4)]
-    assert {(m.header.frame_id, m.child_frame_id) for m in fed.odom} == {('odom', 'base_link')}
-    for message, estimate in zip(fed.odom, _estimates(4), strict=True):
-        expected = drive.T_BASE_LIDAR @ estimate.T_odom_lidar @ se3.inverse(drive.T_BASE_LIDAR)
-        np.testing.assert_allclose(_pose(message)[0], expected, atol=1e-4)
-    # The mounting is turned by half a radian: the way of the base is that much turned, too.
-    last = _pose(fed.odom[-1])[0]
-    assert abs(se3.yaw(drive.T_BASE_LIDAR)) > 0.4
-    driven = _street().truth().positions[[_START, _START + 3]]
-    np.testing.assert_allclose(
-        np.linalg.norm(last[:3, 3]), np.linalg.norm(driven[1] - driven[0]), atol=0.1
-    )
-    np.testing.assert_allclose(np.arctan2(last[1, 3], last[0, 3]), 0.5, atol=0.05)
-
-
-def test_the_transform_on_tf_is_the_pose(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0), _sweep(1))
-    assert len(fed.tf) == 2
-    for sent, message in zip(fed.tf, fed.odom, strict=True):
-        (stamped,) = sent.transforms
-        assert stamped.header == message.header
-        assert stamped.child_frame_id == 'base_link'
+def test_tf_says_the_same_as_odom(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    for sweep in sweeps()[:4]:
+        fed.feed(sweep.message())
+    assert len(fed.tf) == 4
+    for stamped, message, T in zip(fed.tf, fed.odom, fed.poses(), strict=True):
+        assert stamped.header == message.header and stamped.child_frame_id == 'base_link'
         np.testing.assert_allclose(
-            messages.transform_from_message(stamped.transform), _pose(message)[0], atol=1e-12
+            messages.transform_from_message(stamped.transform), T, atol=1e-12
         )
+    assert fed.node.diagnostics.status().level == DiagnosticStatus.OK
 
 
-def test_tf_is_left_to_another_when_asked(make: Make) -> None:
-    fed = Fed(_node(make, publish_tf=False, odom_frame='wheels', base_frame='body'))
-    fed.take(_sweep(0))
-    assert fed.counted('rejected points: no transform') == 1  # base_link is mounted, body is not
-    mounted = drive.static_transform()
-    mounted.transforms[0].header.frame_id = 'body'
-    fed.lockstep.feed('/tf_static', mounted)
-    fed.take(_sweep(1))
-    assert '/tf' not in {p.topic_name for p in fed.node.publishers}
-    assert fed.tf == []
-    assert (fed.odom[0].header.frame_id, fed.odom[0].child_frame_id) == ('wheels', 'body')
+def test_who_does_not_own_the_edge_keeps_off_tf(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False, publish_tf=False))
+    fed.feed(sweeps()[0].message())
+    assert len(fed.odom) == 1 and fed.tf == []
 
 
-def test_the_motion_between_two_messages_is_known_with_its_covariance(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(*(_sweep(k) for k in range(5)))
-    poses = [_pose(message) for message in fed.odom]
-    to_base = se3.adjoint(drive.T_BASE_LIDAR)
-    for (T_a, cov_a), (T_b, cov_b), estimate in zip(
-        poses[:-1], poses[1:], _estimates(5)[1:], strict=True
-    ):
-        assert estimate.growth is not None
-        added = se3.relative_covariance(cov_a, se3.inverse(T_a) @ T_b, cov_b)
-        assert added is not None
+def test_a_second_authority_is_an_error(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    fed.feed(sweeps()[0].message())
+    rival = TransformStamped(header=messages.header(5, 'odom'), child_frame_id='base_link')
+    rival.transform.rotation.w = 1.0
+    fed.lockstep.feed('/tf', TFMessage(transforms=[rival]))
+    fed.feed(sweeps()[1].message())
+    status = fed.node.diagnostics.status()
+    assert status.level == DiagnosticStatus.ERROR and 'another node publishes' in status.message
+
+
+def test_covariances_are_those_of_the_motions(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    estimates = []
+    register = fed.node._odometry.register
+
+    def noted(cloud: PointCloud, stamp: int) -> Any:
+        estimates.append(register(cloud, stamp))
+        return estimates[-1]
+
+    fed.node._odometry.register = noted
+    for sweep in sweeps():
+        fed.feed(sweep.message())
+    to_base = se3.adjoint(T_BASE_LIDAR)
+    known = [messages.from_pose_with_covariance(m.pose) for m in fed.odom]
+    assert known[0][1].max() <= 1e-12
+    pairs = zip(pairwise(known), fed.odom[1:], estimates[1:], strict=True)
+    for ((T_a, c_a), (T_b, c_b)), message, estimate in pairs:
+        motion = se3.inverse(T_a) @ T_b
+        grown = se3.relative_covariance(c_a, motion, c_b)
         np.testing.assert_allclose(
-            added, to_base @ estimate.growth @ to_base.T, rtol=0.01, atol=1e-9
+            grown, to_base @ estimate.growth @ to_base.T, rtol=1e-3, atol=1e-12
         )
-    far = se3.relative_covariance(poses[0][1], se3.inverse(poses[0][0]) @ poses[4][0], poses[4][1])
-    assert far is not None
-    volumes = [np.linalg.slogdet(cov)[1] for _, cov in poses]
-    assert all(b > a for a, b in pairwise(volumes))
+        # The twist is the mean motion of the step in the vehicle's axes.
+        twist = message.twist.twist
+        vector = [twist.linear.x, twist.linear.y, twist.linear.z,
+                  twist.angular.x, twist.angular.y, twist.angular.z]  # fmt: skip
+        np.testing.assert_allclose(se3.exp(0.1 * np.array(vector)), motion, atol=1e-9)
+        step = 0.1**2 * np.array(message.twist.covariance).reshape(6, 6)
+        np.testing.assert_allclose(step, to_base @ estimate.covariance @ to_base.T, rtol=1e-9)
+    assert fed.odom[5].twist.twist.linear.x > 3.0
 
 
-def test_the_twist_is_the_motion_per_second_in_the_base_frame(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0), _sweep(1), _sweep(3))  # one was lost: the next step takes twice as long
-    assert not np.any(fed.odom[0].twist.covariance)  # unknown: nothing has moved yet
-    to_base = se3.adjoint(drive.T_BASE_LIDAR)
-    direct = LidarOdometry(OdometryConfig(threads=1))
-    estimates = [direct.register(_cloud(k), drive.stamp(k)) for k in (0, 1, 3)]
-    for (before, now), estimate, seconds in zip(
-        pairwise(fed.odom), estimates[1:], (0.1, 0.2), strict=True
-    ):
-        moved = se3.log(se3.inverse(_pose(before)[0]) @ _pose(now)[0]) / seconds
-        twist = now.twist.twist
-        got = [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in 'xyz']
-        np.testing.assert_allclose(got, moved, atol=1e-6)
-        assert estimate.covariance is not None
-        np.testing.assert_allclose(
-            np.reshape(now.twist.covariance, (6, 6)),
-            to_base @ estimate.covariance @ to_base.T / seconds**2,
-            rtol=0.01,
-            atol=1e-9,
-        )
-
-
-def test_without_the_transform_nothing_is_guessed(make: Make) -> None:
-    fed = Fed(_node(make), transform=False)
-    fed.take(_sweep(0), _sweep(1))
-    assert fed.odom == [] and fed.tf == []
-    assert fed.counted('rejected points: no transform') == 2
+def test_without_the_mounting_clouds_are_dropped_and_counted(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False), transform=False)
+    fed.feed(sweeps()[0].message())
+    assert fed.odom == [] and fed.counted('rejected points: no transform') == 1
     status = fed.node.diagnostics.status()
     assert status.level == DiagnosticStatus.ERROR
     assert '/tf_static does not connect base_link with lidar' in status.message
-    assert 'base_frame' in status.message  # and what to do
-    fed.lockstep.feed('/tf_static', drive.static_transform())
-    fed.take(_sweep(2))
-    assert fed.stamps() == [drive.stamp(2)]
+    fed.lockstep.feed('/tf_static', mounting())
+    fed.feed(sweeps()[1].message())
+    assert len(fed.odom) == 1
     assert fed.node.diagnostics.status().level == DiagnosticStatus.OK
 
 
-def test_the_frame_of_the_cloud_itself_needs_no_transform(make: Make) -> None:
-    fed = Fed(_node(make, base_frame='lidar'), transform=False)
-    fed.take(_sweep(0), _sweep(1))
-    assert fed.odom[1].child_frame_id == 'lidar'
-    np.testing.assert_allclose(_pose(fed.odom[1])[0], _estimates(2)[1].T_odom_lidar, atol=1e-4)
+def test_a_cloud_in_the_base_frame_needs_no_mounting(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False, base_frame='lidar'), transform=False)
+    fed.feed(sweeps()[0].message())
+    assert len(fed.odom) == 1 and fed.odom[0].child_frame_id == 'lidar'
 
 
-def test_points_that_are_no_numbers_are_left_out_and_counted(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0))
-    xyz = _cloud(1).xyz.copy()
-    holes = np.full((7, 3), np.nan, np.float32)
-    holes[3] = np.inf
-    with_holes = PointCloud(np.vstack([holes, xyz]))
-    fed.take(messages.cloud_message(with_holes, drive.stamp(1), 'lidar'))
-    assert 7 in fed.node.diagnostics.counts().values()
-    assert fed.stamps() == [drive.stamp(0), drive.stamp(1)]
-    expected = drive.T_BASE_LIDAR @ _estimates(2)[1].T_odom_lidar @ se3.inverse(drive.T_BASE_LIDAR)
-    np.testing.assert_allclose(_pose(fed.odom[1])[0], expected, atol=1e-4)
+def test_unusable_clouds_are_dropped_and_counted(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    good = sweeps()
+    fed.feed(good[0].message())
+    empty = PointCloud(np.empty((0, 3), np.float32))
+    fed.feed(good[1].message(cloud=empty))
+    fed.feed(good[2].message(cloud=PointCloud(np.full((900, 3), np.nan, np.float32))))
+    wrong = good[3].message()
+    wrong.fields = [field for field in wrong.fields if field.name != 'z']
+    fed.feed(wrong)
+    short = good[4].message()
+    short.data = short.data[:100]
+    fed.feed(short)
+    assert len(fed.odom) == 1 and fed.counted('rejected points: unusable cloud') == 4
+    fed.feed(good[5].message())
+    assert len(fed.odom) == 2
+    # The gap is bridged.
+    motion = se3.inverse(good[0].T_world_base) @ good[5].T_world_base
+    assert se3.distance(fed.poses()[1], motion)[0] < 0.2
 
 
-def test_broken_sweeps_are_counted_and_the_next_one_goes_on(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0))
-    nameless = _sweep(1)
-    nameless.fields[0].name = 'range'
-    fed.take(nameless)
-    empty = _sweep(1, drive.stamp(1) + 1)
-    empty.width, empty.row_step, empty.data = 0, 0, empty.data[:0]
-    fed.take(empty)
-    few = PointCloud(_cloud(1).xyz[:20])
-    fed.take(messages.cloud_message(few, drive.stamp(1) + 2, 'lidar'))
-    cut = _sweep(1, drive.stamp(1) + 3)
-    cut.data = cut.data[:-5]
-    fed.take(cut)
-    assert fed.rejected() == 4
+def test_points_without_coordinates_are_counted(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    xyz = sweeps()[0].cloud.xyz.copy()
+    xyz[:250] = np.nan
+    fed.feed(sweeps()[0].message(cloud=PointCloud(xyz)))
     assert len(fed.odom) == 1
-    fed.take(_sweep(2))
-    assert fed.stamps() == [drive.stamp(0), drive.stamp(2)]
-    truth = _street().truth().T_world_body
-    moved = se3.inverse(truth[_START]) @ truth[_START + 2]
-    assert np.linalg.norm(_pose(fed.odom[1])[0][:3, 3]) == pytest.approx(
-        np.linalg.norm(moved[:3, 3]), abs=0.1
-    )
-    assert fed.odom[1].twist.twist.linear.x > 0.0
+    assert fed.counted('points without coordinates (NaN)') == 250
 
 
-def test_a_broken_first_sweep_does_not_start_the_odometry(make: Make) -> None:
-    fed = Fed(_node(make))
-    few = PointCloud(_cloud(0).xyz[:20])
-    fed.take(messages.cloud_message(few, drive.stamp(0), 'lidar'))
-    fed.take(_sweep(1))
-    np.testing.assert_allclose(_pose(fed.odom[0])[0], np.eye(4), atol=1e-12)
-
-
-def test_repeated_and_late_sweeps_are_not_registered(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0), _sweep(2), _sweep(2), _sweep(1), _sweep(3))
+def test_repeated_and_late_stamps_are_dropped(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    for index in (0, 1, 1, 0, 2):
+        fed.feed(sweeps()[index].message())
+    assert len(fed.odom) == 3
     assert fed.counted('rejected points: duplicate stamp') == 1
     assert fed.counted('rejected points: late stamp') == 1
-    assert fed.stamps() == [drive.stamp(k) for k in (0, 2, 3)]
 
 
-def test_a_looped_bag_starts_again_at_the_origin(make: Make) -> None:
-    fed = Fed(_node(make))
-    late = drive.stamp(30)
-    fed.take(_sweep(0, late), _sweep(1, late + drive.STEP_NS), _sweep(0), _sweep(1))
+@pytest.mark.parametrize('policy', ['restart', 'refuse'])
+def test_a_clock_that_jumps_back(make: Make, policy: str) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False, on_time_jump=policy))
+    for sweep in sweeps()[:4]:
+        fed.feed(sweep.message(stamp=sweep.stamp_ns + 60_000_000_000))
+    for sweep in sweeps()[5:8]:
+        fed.feed(sweep.message())
     assert fed.counted('clock jumps in points') == 1
-    first, again = fed.odom[:2], fed.odom[2:]
-    np.testing.assert_allclose(_pose(again[0])[0], np.eye(4), atol=1e-12)
-    assert np.trace(_pose(again[0])[1]) < 1e-10  # the covariance starts anew with the pose
-    np.testing.assert_allclose(_pose(again[1])[0], _pose(first[1])[0], atol=1e-4)
-
-
-def test_a_looped_bag_is_refused_until_reset(make: Make) -> None:
-    fed = Fed(_node(make, on_time_jump='refuse'))
-    fed.take(_sweep(0, drive.stamp(30)), _sweep(0), _sweep(1))
-    assert len(fed.odom) == 1
-    assert fed.counted('rejected points: clock jumped back') == 1
+    if policy == 'restart':
+        assert len(fed.odom) == 7
+        np.testing.assert_allclose(fed.poses()[4], np.eye(4), atol=1e-12)
+        motion = se3.inverse(sweeps()[5].T_world_base) @ sweeps()[7].T_world_base
+        assert se3.distance(fed.poses()[6], motion)[0] < 0.1
+        sigma = np.sqrt(np.diag(messages.from_pose_with_covariance(fed.odom[4].pose)[1]))
+        assert sigma.max() <= 1e-6
+        return
+    assert len(fed.odom) == 4
     status = fed.node.diagnostics.status()
-    assert status.level == DiagnosticStatus.ERROR
-    assert 'refusing input until ~/reset' in status.message
-    assert fed.node.on_reset(Trigger.Request(), Trigger.Response()).success
-    assert fed.node.diagnostics.status().level == DiagnosticStatus.OK
-    fed.take(_sweep(1))
-    np.testing.assert_allclose(_pose(fed.odom[-1])[0], np.eye(4), atol=1e-12)
-
-
-def test_reset_starts_again_at_the_origin(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(_sweep(0), _sweep(1))
-    assert np.linalg.norm(_pose(fed.odom[-1])[0][:3, 3]) > 0.1
-    answer = fed.node.on_reset(Trigger.Request(), Trigger.Response())
-    assert answer.success and answer.message
-    fed.take(_sweep(2))
-    np.testing.assert_allclose(_pose(fed.odom[-1])[0], np.eye(4), atol=1e-12)
-    assert not np.any(fed.odom[-1].twist.covariance)
-
-
-def test_a_sweep_of_another_place_is_reported(make: Make) -> None:
-    fed = Fed(_node(make))
-    fed.take(*(_sweep(k) for k in range(6)))
-    before = _pose(fed.odom[-1])[1]
-    random = np.random.default_rng(0)
-    elsewhere = PointCloud(random.uniform(-40, 40, (4000, 3)).astype(np.float32))
-    fed.take(messages.cloud_message(elsewhere, drive.stamp(6), 'lidar'))
-    status = fed.node.diagnostics.status()
-    assert status.level == DiagnosticStatus.WARN
-    assert 'of the points fit the map' in status.message
-    assert np.trace(_pose(fed.odom[-1])[1]) > 10 * np.trace(before)
-    fed.take(_sweep(7))
+    assert status.level == DiagnosticStatus.ERROR and 'jumped back' in status.message
+    fed.node.on_reset(Trigger.Request(), Trigger.Response())
+    fed.feed(sweeps()[8].message())
+    assert len(fed.odom) == 5
+    np.testing.assert_allclose(fed.poses()[4], np.eye(4), atol=1e-12)
     assert fed.node.diagnostics.status().level == DiagnosticStatus.OK
 
 
-def test_namespaces_remaps_and_two_in_one_process(make: Make) -> None:
-    remap = ['--ros-args', '-r', 'points:=/velodyne_points']
-    left = Fed(_node(make, namespace='left'), '/left/')
-    right = _node(make, namespace='right', cli_args=remap)
-    other = Fed(right, '/right/')
-    left.take(_sweep(0), _sweep(1))
-    other.lockstep.feed('/velodyne_points', _sweep(1))
-    assert len(left.odom) == 2 and len(other.odom) == 1
-    np.testing.assert_allclose(_pose(other.odom[0])[0], np.eye(4), atol=1e-12)
-    names = {s.topic_name for s in right.subscriptions}
-    assert {'/velodyne_points', '/tf_static'} <= names
-    assert {'/right/odom', '/tf', '/diagnostics'} <= {p.topic_name for p in right.publishers}
-    served = dict(right.get_service_names_and_types_by_node('lidar_odometry', '/right'))
-    assert '/right/lidar_odometry/reset' in served
+def test_a_sweep_that_does_not_fit_is_told(make: Make) -> None:
+    fed = Fed(make(LidarOdometryNode, threaded=False))
+    for sweep in sweeps()[:6]:
+        fed.feed(sweep.message())
+    clutter = np.random.default_rng(0).uniform(-20, 20, (8000, 3)).astype(np.float32)
+    fed.feed(sweeps()[6].message(cloud=PointCloud(clutter)))
+    assert fed.counted('failed registrations') == 1 and fed.counted('scans') == 7
+    status = fed.node.diagnostics.status()
+    assert status.level == DiagnosticStatus.WARN and 'of the points fit the map' in status.message
+    before, after = (messages.from_pose_with_covariance(m.pose)[1] for m in fed.odom[-2:])
+    assert np.sqrt(after[5, 5]) > 1.0 > 100 * np.sqrt(before[5, 5])
 
 
-def test_threads_deliver_and_reset(make: Make, spin_until: Callable[..., bool]) -> None:
-    node = make(LidarOdometryNode, threads=1)
-    odom: list[Odometry] = []
-    node.create_subscription(Odometry, 'odom', odom.append, qos.RELIABLE)
-    node._transforms.on_tf_static(drive.static_transform())
-    for step in range(3):
-        node.on_points(_sweep(step))
-    assert spin_until([node], lambda: len(odom) == 3)
-    expected = drive.T_BASE_LIDAR @ _estimates(3)[2].T_odom_lidar @ se3.inverse(drive.T_BASE_LIDAR)
-    np.testing.assert_allclose(_pose(odom[2])[0], expected, atol=1e-4)
-    node.on_reset(Trigger.Request(), Trigger.Response())
-    node.on_points(_sweep(3))
-    assert spin_until([node], lambda: len(odom) == 4)
-    np.testing.assert_allclose(_pose(odom[3])[0], np.eye(4), atol=1e-12)
+def test_instances_do_not_mix(make: Make) -> None:
+    nodes = [make(LidarOdometryNode, namespace=name, threaded=False) for name in ('left', 'right')]
+    left, right = (Fed(node, f'/{node.get_namespace()[1:]}/') for node in nodes)
+    for sweep in sweeps()[:3]:
+        left.feed(sweep.message())
+    right.feed(sweeps()[0].message())
+    assert (len(left.odom), len(right.odom)) == (3, 1)
 
 
-def test_the_reliable_parameter_asks_for_every_cloud(make: Make) -> None:
-    for reliable, profile in ((False, qos.SENSOR), (True, qos.SENSOR_RELIABLE)):
-        node = _node(make, reliable_points=reliable)
+def test_the_queue_drops_the_oldest_and_counts(make: Make, spin_until: Callable[..., bool]) -> None:
+    node = make(LidarOdometryNode, waiting_clouds=2)
+    node._transforms.on_tf_static(mounting())
+    gate, begun = threading.Event(), threading.Event()
+    register = node._odometry.register
+
+    def slow(cloud: PointCloud, stamp: int) -> Any:
+        begun.set()
+        assert gate.wait(20.0)
+        return register(cloud, stamp)
+
+    node._odometry.register = slow
+    got: list[int] = []
+    node._odom_out.publish = lambda m: got.append(messages.stamp_ns(m.header.stamp))
+    node.on_points(sweeps()[0].message())
+    assert begun.wait(10.0)
+    for sweep in sweeps()[1:6]:
+        node.on_points(sweep.message())
+    gate.set()
+    assert spin_until([node], lambda: len(got) == 3, 20.0)
+    assert node.diagnostics.counted('dropped points: queue full') == 3
+    assert got == [sweeps()[i].stamp_ns for i in (0, 4, 5)]
+
+
+def test_quality_of_service_is_the_users_choice(make: Make) -> None:
+    for reliable in (False, True):
+        node = make(LidarOdometryNode, reliable_points=reliable)
         (points,) = [s for s in node.subscriptions if s.topic_name == '/points']
-        assert points.qos_profile.reliability == profile.reliability
+        asked = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        assert points.qos_profile.reliability == asked
 
 
-def test_a_wrong_parameter_is_named(make: Make) -> None:
-    with pytest.raises(ConfigError, match='on_time_jump must be one of restart, refuse'):
-        make(LidarOdometryNode, on_time_jump='panic')
-    with pytest.raises(ConfigError, match='min_range must be below max_range'):
-        make(LidarOdometryNode, min_range=50.0, max_range=20.0)
+def test_wrong_parameters_are_one_line(make: Make) -> None:
+    with pytest.raises(ConfigError, match='min_range must be below'):
+        make(LidarOdometryNode, min_range=90.0, max_range=50.0)
+    with pytest.raises(ConfigError, match='on_time_jump'):
+        make(LidarOdometryNode, on_time_jump='sometimes')
 
 
-def test_help_names_topics_and_services() -> None:
-    code = 'from lcd_loop_closure.nodes.lidar_odometry_node import main; raise SystemExit(main())'
-    run = subprocess.run(
-        [sys.executable, '-c', code, '--help'], capture_output=True, text=True, check=True
+def test_the_command_explains_itself() -> None:
+    command = Path(sys.executable).parent / 'lidar_odometry'
+    answer = subprocess.run([command, '--help'], capture_output=True, text=True, check=True)
+    for word in ('points', 'odom', 'min_range', 'publish_tf', 'ros2 run', 'polish = True'):
+        assert word in answer.stdout
+    wrong = subprocess.run(
+        [command, '--ros-args', '-p', 'max_range:=0.1'], capture_output=True, text=True
     )
-    for word in ('Subscribes', 'Publishes', 'points', 'odom', '~/reset', 'ros2 run'):
-        assert word in run.stdout
+    assert wrong.returncode == 1
+    assert wrong.stderr.strip().splitlines()[-1].startswith('error: parameter max_range')
