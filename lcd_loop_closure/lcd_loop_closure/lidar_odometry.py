@@ -21,6 +21,7 @@ __all__ = ['LidarOdometry', 'OdometryConfig', 'OdometryEstimate']
 
 _CELL = 4.0  # voxels: residuals in a cell of this size are taken for dependent
 _MEMORY = 0.9  # of the disagreement between KISS-ICP and the surfaces, per sweep
+_STARTS = np.array([0.35, 0.7, 1.05])  # of the distance that the vehicle may drive per sweep
 _NOT_WORSE = 0.95  # a motion that is not what it seemed makes a sweep fit less
 _YOUNG = 5  # sweeps: the surfaces of a map of fewer are full of the scanner's rings
 
@@ -130,13 +131,19 @@ class LidarOdometry:
         return OdometryEstimate(stamp_ns, np.eye(4), None, None, None, 1.0, 0.0, 0)
 
     def _first_twist(self, sweep: Sweep, step_s: float) -> Array:
-        """Return the first motion, tried from standing and from driving each way."""
-        reach = self.settings.unseen_speed * step_s
-        fits = []
-        for x, y in reach * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]):
-            guess = self._T_odom_middle @ se3.exp([x, y, 0, 0, 0, 0])
-            fits.append(self._registration.fit(sweep, guess, self._prior(step_s)))
-        best = max(fits, key=lambda fit: fit.matches.fitness)
+        """Return the first motion, tried from standing and from driving each way.
+
+        KISS-ICP alone would mostly find that the vehicle stands, held by the rings on the ground.
+        """
+        prior = self._prior(step_s)
+        best = self._registration.fit(sweep, self._T_odom_middle, prior)
+        for metres in self.settings.unseen_speed * step_s * _STARTS:
+            for angle in np.arange(8) * np.pi / 4:
+                drive = [metres * np.cos(angle), metres * np.sin(angle), 0, 0, 0, 0]
+                start = self._T_odom_middle @ se3.exp(drive)
+                fit = self._registration.polished(sweep, start, prior)
+                if fit.matches.fitness > best.matches.fitness:
+                    best = fit
         return se3.log(se3.inverse(self._T_odom_middle) @ best.T_odom_middle) / step_s
 
     def _step(self, cloud: PointCloud, sweep: Sweep, stamp_ns: int) -> OdometryEstimate:
@@ -152,9 +159,9 @@ class LidarOdometry:
             # The motion within the sweep was undone by a guess of it; now it is known better.
             now = self._unsteady.at_middle(motion, change) / step_s
             again = self._registration.prepare(cloud, now)
-            better = self._registration.polished(again, fit, prior)
+            better = self._registration.polished(again, fit.T_odom_middle, prior)
             if better.matches.fitness > _NOT_WORSE * fit.matches.fitness:
-                sweep, fit = again, better
+                sweep, fit = again, replace(better, disagreement=fit.disagreement)
                 motion, change = self._motion(fit, step_s)
         share = sweep.middle_s / step_s
         T_middle_stamp = self._unsteady.to_stamp(share, motion, change)

@@ -1,7 +1,7 @@
 """Register sweeps against the local map of the ones before, and notice when one does not fit."""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ _RECENT = 20  # sweeps whose fitness says what is usual
 _AS_USUAL = 0.9  # share of the usual fitness that a brief registration must reach
 _DOUBTFUL = 0.75  # of the usual fitness: less is worth a search
 _BETTER = 1.1  # times the fitness that a search must find to be believed
+_SUSPICIOUS = 0.2  # voxels between the guess and KISS-ICP's pose
 _HEADINGS = 4  # that are tried by registration after a search
 
 
@@ -49,14 +50,14 @@ class Fit:
 
     Attributes:
         T_odom_middle: pose of the lidar in the middle of the sweep.
-        disagreement: [6] twist from KISS-ICP's pose to that on the surfaces.
         matches: with the surfaces, at the pose.
+        disagreement: [6] twist from KISS-ICP's pose to that on the surfaces; zero where it is none.
         healthy, recovered, reason: as of OdometryEstimate.
     """
 
     T_odom_middle: Array
-    disagreement: Array
     matches: SurfaceMatches
+    disagreement: Array = field(default_factory=lambda: np.zeros(6))
     healthy: bool = True
     recovered: bool = False
     reason: str = ''
@@ -148,19 +149,25 @@ class SweepRegistration:
             rough: for a guess that may be far off or wrong.
             brief: leave the last centimetre to the polish, which is faster at it.
         """
-        noise = self.settings.range_noise
-        T_kiss = self._kiss.align(sweep.source, guess, rough=rough, brief=brief)
-        T_polished = polish(sweep.sample, T_kiss, self._surfaces, noise, prior)
-        T = T_polished if self.settings.polish else T_kiss
-        matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
-        return Fit(T, se3.log(se3.inverse(T_kiss) @ T_polished), matches)
+        T_kiss = self._kiss.align(sweep.source, guess, rough=rough)
+        on_surfaces = self.polished(sweep, T_kiss, prior)
+        disagreement = se3.log(se3.inverse(T_kiss) @ on_surfaces.T_odom_middle)
+        if not self.settings.polish:
+            noise = self.settings.range_noise
+            matches = match_surfaces(sweep.sample, T_kiss, self._surfaces, noise)
+            return Fit(T_kiss, matches, disagreement)
+        best = on_surfaces
+        if se3.distance(guess, T_kiss)[0] > _SUSPICIOUS * self.voxel_size:
+            # A scanner's own rings on the ground may have pulled KISS-ICP off a good guess.
+            from_guess = self.polished(sweep, guess, prior)
+            best = max(on_surfaces, from_guess, key=lambda one: one.matches.fitness)
+        return replace(best, disagreement=disagreement)
 
-    def polished(self, sweep: Sweep, fit: Fit, prior: Array) -> Fit:
-        """Move a fit onto the surfaces with a sweep that was prepared anew."""
+    def polished(self, sweep: Sweep, T_odom_middle: Array, prior: Array) -> Fit:
+        """Return the fit on the surfaces nearest to a pose."""
         noise = self.settings.range_noise
-        T = polish(sweep.sample, fit.T_odom_middle, self._surfaces, noise, prior)
-        matches = match_surfaces(sweep.sample, T, self._surfaces, noise)
-        return replace(fit, T_odom_middle=T, matches=matches)
+        T = polish(sweep.sample, T_odom_middle, self._surfaces, noise, prior)
+        return Fit(T, match_surfaces(sweep.sample, T, self._surfaces, noise))
 
     def guarded(
         self, cloud: PointCloud, sweep: Sweep, T_odom_last: Array, guess: Array, prior: Array

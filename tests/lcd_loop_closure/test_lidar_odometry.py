@@ -1,5 +1,7 @@
 """Odometry equals KISS-ICP where it should, the truth in simulation, and notices its failures."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -123,14 +125,23 @@ def test_lost_sweeps_are_bridged_by_the_speed_and_the_stamps() -> None:
     assert np.linalg.norm(error[:3]) < 0.1 and all(e.healthy for e in estimates)
 
 
+ONE_THREAD = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from odometry_drives import drive, follow
+for estimate in follow(drive('corner', 0, tuple(range(20, 28))), threads=1)[1]:
+    parts = [estimate.T_odom_lidar, estimate.covariance, estimate.growth]
+    print(*(part.tobytes().hex() for part in parts if part is not None), estimate.fitness)
+"""
+
+
 def test_one_thread_repeats_exactly() -> None:
-    samples = drive('corner', 0, CORNER)[:8]
-    first, second = (follow(samples, threads=1)[1] for _ in range(2))
-    for a, b in zip(first, second, strict=True):
-        assert a.T_odom_lidar.tobytes() == b.T_odom_lidar.tobytes()
-        assert a.fitness == b.fitness
-        if a.covariance is not None:
-            assert a.covariance.tobytes() == b.covariance.tobytes()
+    """Each in a process of its own: KISS-ICP keeps the first number of threads that it is given."""
+    command = [sys.executable, '-c', ONE_THREAD, str(Path(__file__).parent)]
+    first, second = (
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert len(first.splitlines()) == 8 and first == second
 
 
 def test_points_without_coordinates_change_nothing() -> None:
@@ -143,7 +154,8 @@ def test_points_without_coordinates_change_nothing() -> None:
         xyz[1] = np.inf
         broken.append(replace(sample, cloud=PointCloud(xyz)))
     _, with_nan = follow(broken, threads=1)
-    np.testing.assert_array_equal(with_nan[-1].T_odom_lidar, plain[-1].T_odom_lidar)
+    # Threads add up in any order.
+    np.testing.assert_allclose(with_nan[-1].T_odom_lidar, plain[-1].T_odom_lidar, atol=1e-9)
 
 
 def test_what_cannot_be_registered_is_refused_and_changes_nothing() -> None:
@@ -156,7 +168,7 @@ def test_what_cannot_be_registered_is_refused_and_changes_nothing() -> None:
             odometry.register(PointCloud(xyz), samples[3].stamp_ns)
     after = odometry.register(samples[3].cloud, samples[3].stamp_ns)
     expected = follow(samples, threads=1)[1][-1]
-    np.testing.assert_array_equal(after.T_odom_lidar, expected.T_odom_lidar)
+    np.testing.assert_allclose(after.T_odom_lidar, expected.T_odom_lidar, atol=1e-9)
 
 
 def test_a_first_sweep_that_is_refused_leaves_it_at_the_start() -> None:
