@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class PoseGraph:
-    """Keep the corrected poses of all keyframes by iSAM2; not to be used from two threads at once.
+    """Keep the corrected poses of all keyframes by iSAM2. Not thread-safe.
 
     Args:
         settings: admission of loops.
@@ -122,9 +122,7 @@ class PoseGraph:
         return True
 
     def use_imu(self, settings: ImuConfig, T_base_imu: se3.Array) -> None:
-        """Tie keyframes by an inertial sensor too; before the first keyframe.
-
-        The first keyframe is then levelled by gravity, and z of the map is up.
+        """Tie keyframes by an inertial sensor too, and level the first one by gravity.
 
         Raises:
             ConfigError: there are keyframes already.
@@ -143,8 +141,7 @@ class PoseGraph:
     ) -> None:
         """Tie the last keyframe to a satellite fix, at the next update.
 
-        T_keyframe_base: motion by odometry from the last keyframe to the time of the fix; None when
-        the fix was taken with it.
+        T_keyframe_base: motion from the last keyframe to the fix; None when taken with it.
 
         Raises:
             DataError: there is no keyframe yet, or the fix cannot be used; the text says why.

@@ -1,5 +1,6 @@
 """Write small drives in the published layouts, and bags with rosbags' own writers."""
 
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+sys.path.append(str(Path(__file__).parent))
 
 # Real numbers of KITTI 00: the colour camera is not where camera 0 is.
 P0 = '718.856 0 607.1928 0 0 718.856 185.2157 0 0 0 1 0'

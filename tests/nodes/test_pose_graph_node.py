@@ -1,113 +1,40 @@
 """Feed pose_graph by hand and read what it publishes."""
 
-from collections import defaultdict
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 import made_up_drive as drive
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Path as PathMessage
-from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus, PointCloud2
+from fed_pose_graph import ROUND, TRUE_LOOPS, Fed, Make, errors, odom, second_round
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
-from visualization_msgs.msg import Marker, MarkerArray
 
-from bags.nodes.lockstep import LockStep
 from lcd_common import se3
-from lcd_common.nodes import messages, qos
+from lcd_common.nodes import messages
 from lcd_loop_closure.gnss import GnssDatum
 from lcd_loop_closure.loop import LoopStatus
-from lcd_loop_closure.map_store import load_map
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_msgs.msg import LoopConstraintArray
-from lcd_msgs.srv import AddLoop, LoadMap, RemoveLoop, SaveMap
+from lcd_msgs.srv import AddLoop, RemoveLoop
 
 pytestmark = pytest.mark.ros
-Make = Callable[..., Any]
-ROUND = 126  # steps of one round
-DRIFT = 3e-4
-
-
-class Fed:
-    """Nodes in lock-step, and what they published by topic."""
-
-    def __init__(self, *nodes: PoseGraphNode, prefix: str = '/') -> None:
-        self.node, self.prefix = nodes[0], prefix
-        self.lockstep = LockStep(nodes)
-        self.heard: dict[str, list[Any]] = defaultdict(list)
-        for topic in ('path', 'pose', 'graph/keyframes', 'loops', 'loop_markers', 'map'):
-            self.lockstep.listen(prefix + topic, self.heard[topic].append)
-        self.lockstep.listen('/tf', self.heard['tf'].append)
-        self.lockstep.feed('/tf_static', drive.static_transform())
-
-    def feed(self, topic: str, message: Any) -> None:
-        """Feed a message on a relative topic."""
-        self.lockstep.feed(self.prefix + topic, message)
-
-    def drive(self, steps: range, drift: float = 0.0, first_id: int = 0) -> None:
-        """Feed odometry and the keyframe of every step."""
-        for step in steps:
-            self.feed('odom', drive.odom_message(step, drift) if step % 10 == 0 else _odom(step))
-            self.feed('keyframe', drive.keyframe(step, drift, first_id))
-
-    def settle(self) -> None:
-        """Deliver what was published outside of a feed."""
-        self.lockstep.feed('/nothing', TFMessage())
-
-    def refresh(self) -> None:
-        """Do what the node's timer does."""
-        self.node.refresh()
-        self.settle()
-
-    def path(self) -> np.ndarray:
-        """Return the poses of the last path."""
-        self.settle()
-        poses = self.heard['path'][-1].poses
-        return np.array([messages.transform_from_pose(p.pose) for p in poses]).reshape(-1, 4, 4)
-
-    def counted(self, cause: str) -> int:
-        """Return a counter of the node."""
-        return self.node.diagnostics.counted(cause)
-
-
-def _odom(step: int) -> Any:
-    """Return odometry without its covariance, which takes long to add up."""
-    return drive.odom_message(step, covariance=False)
-
-
-def _second_round(fed: Fed, loops: list[tuple[int, int]], wrong_by_m: float = 0.0) -> None:
-    for step in range(ROUND + 6):
-        fed.feed('keyframe', drive.keyframe(step, DRIFT))
-    for match, query in loops:
-        fed.feed('loop_constraint', drive.loop(match, query, wrong_by_m))
-
-
-TRUE_LOOPS = [(0, ROUND), (2, ROUND + 2), (4, ROUND + 4)]
-
-
-def _errors(fed: Fed) -> np.ndarray:
-    truth = np.array([drive.true_pose(k) for k in range(len(fed.path()))])
-    return np.linalg.norm(fed.path()[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
 def test_loops_correct_the_path_and_are_shown(make: Make) -> None:
     fed = Fed(make(PoseGraphNode, threaded=False))
-    _second_round(fed, [])
-    before = _errors(fed).max()
+    second_round(fed, [])
+    before = errors(fed).max()
     _second_round_loops = [drive.loop(*pair) for pair in TRUE_LOOPS]
     for message in _second_round_loops:
         fed.feed('loop_constraint', message)
     fed.feed('loop_constraint', drive.loop(30, 90, status=LoopStatus.REJECTED_FITNESS))
     fed.refresh()
     assert before > 0.5
-    assert _errors(fed).max() < 0.25 * before
+    assert errors(fed).max() < 0.25 * before
     positions = positions_from_message(fed.heard['graph/keyframes'][-1])
     np.testing.assert_array_equal(positions.ids, np.arange(ROUND + 6))
     np.testing.assert_allclose(positions.xyz, fed.path()[:, :3, 3], atol=1e-5)
@@ -126,7 +53,7 @@ def test_loops_correct_the_path_and_are_shown(make: Make) -> None:
 
 def test_a_false_loop_does_not_bend_the_path_and_is_reported(make: Make) -> None:
     fed = Fed(make(PoseGraphNode, threaded=False))
-    _second_round(fed, TRUE_LOOPS)
+    second_round(fed, TRUE_LOOPS)
     before = fed.path()
     fed.feed('loop_constraint', drive.loop(20, 80, wrong_by_m=8.0))
     assert np.abs(fed.path()[:, :3, 3] - before[:, :3, 3]).max() < 0.05
@@ -140,7 +67,7 @@ def test_a_false_loop_does_not_bend_the_path_and_is_reported(make: Make) -> None
 
 def test_map_odom_and_pose_follow_odometry(make: Make) -> None:
     fed = Fed(make(PoseGraphNode, threaded=False))
-    fed.feed('odom', _odom(0))
+    fed.feed('odom', odom(0))
     assert len(fed.heard['tf']) == 1  # the tree is whole from the first odometry
     assert fed.heard['pose'] == []
     fed.drive(range(1, 21))
@@ -263,18 +190,18 @@ def test_pause_keeps_the_map_and_resuming_bridges_the_gap(make: Make) -> None:
 
 def test_loops_by_hand(make: Make) -> None:
     fed = Fed(make(PoseGraphNode, threaded=False))
-    _second_round(fed, [])
-    before = _errors(fed).max()
+    second_round(fed, [])
+    before = errors(fed).max()
     request = AddLoop.Request(match_id=0, query_id=ROUND)
     request.transform = drive.loop(0, ROUND).transform
     services = fed.node.map_services
     assert services.on_add_loop(request, AddLoop.Response()).success
-    assert _errors(fed).max() < 0.5 * before
+    assert errors(fed).max() < 0.5 * before
     removed = services.on_remove_loop(
         RemoveLoop.Request(match_id=0, query_id=ROUND), RemoveLoop.Response()
     )
     assert removed.success
-    assert _errors(fed).max() == pytest.approx(before, rel=0.1)
+    assert errors(fed).max() == pytest.approx(before, rel=0.1)
     assert fed.node.map.graph.loops()[0].status is LoopStatus.REJECTED_BY_HAND
     again = services.on_remove_loop(
         RemoveLoop.Request(match_id=0, query_id=9), RemoveLoop.Response()
@@ -356,127 +283,3 @@ def test_the_imu_levels_a_new_map_and_is_not_begun_in_the_middle(make: Make) -> 
     late.feed('imu', sample)
     assert late.counted('rejected imu: too late') == 1
     np.testing.assert_allclose(late.path()[0], np.eye(4), atol=1e-9)
-
-
-def test_a_map_is_saved_and_gone_on_in(make: Make, tmp_path: Path) -> None:
-    fed = Fed(make(PoseGraphNode, threaded=False))
-    _second_round(fed, TRUE_LOOPS)
-    (answer,) = _finished(
-        fed.node.map_services.on_save_map(
-            SaveMap.Request(path=str(tmp_path / 'map')), SaveMap.Response()
-        )
-    )
-    assert answer.success, answer.message
-    count = ROUND + 6
-    assert len(load_map(tmp_path / 'map').graph) == count
-
-    later = Fed(make(PoseGraphNode, threaded=False, map=str(tmp_path / 'map')))
-    later.node.publish_graph()
-    np.testing.assert_allclose(later.path()[:, :3, 3], fed.path()[:, :3, 3], atol=0.02)
-    later.feed('odom', _odom(0))
-    assert later.heard['tf'] == []  # nobody knows yet where odometry starts
-    later.feed('keyframe', drive.keyframe(0))
-    assert later.counted('rejected keyframe: other session') == 1
-    assert 'load it in loop_closure too' in later.node.diagnostics.status().message
-    later.drive(range(1, 6), first_id=count)
-    assert later.node.diagnostics.status().level == DiagnosticStatus.WARN
-    for step in (2, 4):
-        later.feed('loop_constraint', drive.loop(step, step, query_id=count + step))
-    assert later.node.diagnostics.status().level == DiagnosticStatus.OK
-    later.feed('odom', _odom(6))
-    assert len(later.heard['tf']) == 1
-    assert len(later.path()) == count + 5
-    assert se3.distance(later.path()[-1], drive.true_pose(5))[0] < 0.5
-
-
-def test_a_person_says_where_the_vehicle_is(make: Make, tmp_path: Path) -> None:
-    fed = Fed(make(PoseGraphNode, threaded=False))
-    fed.drive(range(4))
-    _finished(
-        fed.node.map_services.on_save_map(
-            SaveMap.Request(path=str(tmp_path / 'map')), SaveMap.Response()
-        )
-    )
-    answer = fed.node.map_services.on_load_map(
-        LoadMap.Request(path=str(tmp_path / 'map')), LoadMap.Response()
-    )
-    assert answer.success and answer.message.startswith('4 keyframes')
-    fed.drive(range(10, 12), first_id=0)
-    pose = PoseWithCovarianceStamped()
-    pose.pose.pose = messages.pose_message(drive.true_pose(11))
-    fed.feed('initialpose', pose)
-    np.testing.assert_allclose(fed.path()[-1], drive.true_pose(11), atol=1e-6)
-    fed.feed('initialpose', pose)
-    assert fed.counted('rejected initialpose: not needed') == 1
-
-
-def test_saving_and_loading_answer_what_went_wrong(make: Make, tmp_path: Path) -> None:
-    node = make(PoseGraphNode, threaded=False)
-    (answer,) = _finished(
-        node.map_services.on_save_map(SaveMap.Request(path=str(tmp_path)), SaveMap.Response())
-    )
-    assert not answer.success and 'no keyframe yet' in answer.message
-    fed = Fed(node)
-    fed.drive(range(2))
-    (tmp_path / 'mine.txt').write_text('precious')
-    (answer,) = _finished(
-        node.map_services.on_save_map(SaveMap.Request(path=str(tmp_path)), SaveMap.Response())
-    )
-    assert not answer.success and 'mine.txt' in answer.message
-    for path in ('', str(tmp_path)):
-        answer = node.map_services.on_load_map(LoadMap.Request(path=path), LoadMap.Response())
-        assert not answer.success and answer.message
-    assert len(fed.path()) == 2  # a map that cannot be loaded costs nothing
-
-
-def test_everything_over_dds_beside_the_callbacks(
-    make: Make, spin_until: Callable[..., bool], tmp_path: Path
-) -> None:
-    node = make(PoseGraphNode, namespace='car', map_period=0.2, display_period=0.2)
-    other = make(PoseGraphNode, namespace='other', publish_tf=False)
-    heard: dict[str, list[Any]] = defaultdict(list)
-    for kind, topic in (
-        (PathMessage, 'path'),
-        (PointCloud2, 'map'),
-        (MarkerArray, 'loop_markers'),
-        (LoopConstraintArray, 'loops'),
-    ):
-        node.create_subscription(kind, topic, heard[topic].append, qos.LATCHED)
-    for step in range(ROUND + 6):
-        node.on_keyframe(drive.keyframe(step, DRIFT))
-    for pair in [*TRUE_LOOPS]:
-        node.on_loop_constraint(drive.loop(*pair))
-    node.on_loop_constraint(drive.loop(20, 80, wrong_by_m=8.0))
-    # The verdict comes from the solver's process and through the executor.
-    assert spin_until([node, other], lambda: not node.map.graph.needs_verdict, timeout_s=30.0)
-    statuses = [loop.status for loop in node.map.graph.loops()]
-    assert statuses == [LoopStatus.ACCEPTED] * 3 + [LoopStatus.REJECTED_BY_GRAPH]
-    assert spin_until(
-        [node],
-        lambda: (
-            heard['map']
-            and heard['map'][-1].width > 1000
-            and heard['loops']
-            and heard['loops'][-1].loops[-1].status == LoopStatus.REJECTED_BY_GRAPH
-        ),
-        timeout_s=20.0,
-    )
-    assert heard['loop_markers'][-1].markers[0].action == Marker.ADD
-    assert len(heard['path'][-1].poses) == ROUND + 6
-    save = other.create_client(SaveMap, '/car/pose_graph/save_map')
-    assert spin_until([node, other], save.service_is_ready)
-    answer = save.call_async(SaveMap.Request(path=str(tmp_path / 'map')))
-    assert spin_until([node, other], answer.done, timeout_s=20.0)
-    assert answer.result().success
-    load = other.create_client(LoadMap, '/other/pose_graph/load_map')
-    assert spin_until([other], load.service_is_ready)
-    answer = load.call_async(LoadMap.Request(path=str(tmp_path / 'map')))
-    assert spin_until([node, other], answer.done, timeout_s=20.0)
-    assert len(other.map) == ROUND + 6
-
-
-def _finished(coroutine: Any) -> tuple[Any]:
-    """Run a coroutine that has nothing to wait for."""
-    with pytest.raises(StopIteration) as stopped:
-        coroutine.send(None)
-    return (stopped.value.value,)
