@@ -19,7 +19,7 @@ from lcd_common.se3 import Array
 
 _ROUGH_ITERATIONS = 30
 # Norm of the last step, metres and radians; KISS-ICP's own is 1e-4.
-_BRIEF_CONVERGENCE = 3e-3
+_BRIEF_CONVERGENCE = 1e-2
 
 
 class KissRegistration:
@@ -49,6 +49,7 @@ class KissRegistration:
         self._rough_registration = get_registration(rough)
         brief = self._config.model_copy(deep=True)
         brief.registration.convergence_criterion = _BRIEF_CONVERGENCE
+        brief.registration.max_num_iterations = _ROUGH_ITERATIONS
         self._brief_registration = get_registration(brief)
         self.clear()
 
@@ -79,7 +80,7 @@ class KissRegistration:
     ) -> Array:
         """Return the pose T_map_lidar.
 
-        Briefly is to end a centimetre before KISS-ICP would, for somebody who goes on from there.
+        Briefly is to end centimetres before KISS-ICP would, for somebody who goes on from there.
 
         Roughly is from a guess that may be far off or wrong: with twice the distance that matches
         may have, and few iterations, as what does not fit would go on for seconds.

@@ -22,6 +22,7 @@ __all__ = ['LidarOdometry', 'OdometryConfig', 'OdometryEstimate']
 _CELL = 4.0  # voxels: residuals in a cell of this size are taken for dependent
 _MEMORY = 0.9  # of the disagreement between KISS-ICP and the surfaces, per sweep
 _STARTS = np.array([0.35, 0.7, 1.05])  # of the distance that the vehicle may drive per sweep
+_FEW = 4  # every so many points are enough to tell these starts apart
 _NOT_WORSE = 0.95  # a motion that is not what it seemed makes a sweep fit less
 _YOUNG = 5  # sweeps: the surfaces of a map of fewer are full of the scanner's rings
 
@@ -136,12 +137,14 @@ class LidarOdometry:
         KISS-ICP alone would mostly find that the vehicle stands, held by the rings on the ground.
         """
         prior = self._prior(step_s)
-        best = self._registration.fit(sweep, self._T_odom_middle, prior)
+        few = replace(sweep, sample=sweep.sample[::_FEW])
+        standing = self._registration.fit(sweep, self._T_odom_middle, prior)
+        best = self._registration.polished(few, standing.T_odom_middle, prior)
         for metres in self.settings.unseen_speed * step_s * _STARTS:
             for angle in np.arange(8) * np.pi / 4:
                 drive = [metres * np.cos(angle), metres * np.sin(angle), 0, 0, 0, 0]
                 start = self._T_odom_middle @ se3.exp(drive)
-                fit = self._registration.polished(sweep, start, prior)
+                fit = self._registration.polished(few, start, prior)
                 if fit.matches.fitness > best.matches.fitness:
                     best = fit
         return se3.log(se3.inverse(self._T_odom_middle) @ best.T_odom_middle) / step_s

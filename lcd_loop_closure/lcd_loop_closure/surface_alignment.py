@@ -14,7 +14,7 @@ _THIN = 0.15  # share of the voxel's size: thinner than this is a surface, wider
 _STEEP = 0.7  # cosine of 45 degrees
 _FLOOR_M = 0.002  # quantisation of ranges and angles; keeps weights finite
 _ROUNDS = 12  # Gauss-Newton steps at most; each looks up its voxels afresh. Three are usual
-_CONVERGED_M, _CONVERGED_RAD = 5e-4, 5e-5
+_CONVERGED_M, _CONVERGED_RAD = 1e-3, 1e-4
 _REACH = (0.4, 0.15)  # voxels, in the first rounds
 _HELD = 0.5  # share of a direction's information that must be more than noise of the normals
 

@@ -17,10 +17,11 @@ from lcd_loop_closure.yaw_search import yaw_candidates
 
 _SAMPLE = 1000  # points of a sweep that are matched with surfaces
 _RECENT = 20  # sweeps whose fitness says what is usual
-_AS_USUAL = 0.9  # share of the usual fitness that a brief registration must reach
 _DOUBTFUL = 0.75  # of the usual fitness: less is worth a search
 _BETTER = 1.1  # times the fitness that a search must find to be believed
 _SUSPICIOUS = 0.2  # voxels between the guess and KISS-ICP's pose
+_NEW = 0.9  # times the fitness after a search in vain: less is worth another one
+_TURNS, _TURN_SPAN = 20, np.radians(40.0)  # headings near the guess, for a turn that began
 _HEADINGS = 4  # that are tried by registration after a search
 
 
@@ -90,6 +91,7 @@ class SweepRegistration:
         self._kiss.clear()
         self._surfaces.clear()
         self._fitness: deque[float] = deque(maxlen=_RECENT)
+        self._searched = 1.0
         self.sweeps = 0
 
     def points(self) -> Array:
@@ -147,9 +149,9 @@ class SweepRegistration:
             guess: T_odom_middle to start from.
             prior: 6x6 information that keeps what the sweep does not tell.
             rough: for a guess that may be far off or wrong.
-            brief: leave the last centimetre to the polish, which is faster at it.
+            brief: leave the last centimetres to the polish, which is faster at it.
         """
-        T_kiss = self._kiss.align(sweep.source, guess, rough=rough)
+        T_kiss = self._kiss.align(sweep.source, guess, rough=rough, brief=brief)
         on_surfaces = self.polished(sweep, T_kiss, prior)
         disagreement = se3.log(se3.inverse(T_kiss) @ on_surfaces.T_odom_middle)
         if not self.settings.polish:
@@ -157,7 +159,8 @@ class SweepRegistration:
             matches = match_surfaces(sweep.sample, T_kiss, self._surfaces, noise)
             return Fit(T_kiss, matches, disagreement)
         best = on_surfaces
-        if se3.distance(guess, T_kiss)[0] > _SUSPICIOUS * self.voxel_size:
+        moved_m = se3.distance(guess, T_kiss)[0]
+        if not rough and moved_m > _SUSPICIOUS * self.voxel_size:
             # A scanner's own rings on the ground may have pulled KISS-ICP off a good guess.
             from_guess = self.polished(sweep, guess, prior)
             best = max(on_surfaces, from_guess, key=lambda one: one.matches.fitness)
@@ -178,10 +181,17 @@ class SweepRegistration:
             The sweep, which may have been prepared anew, and its fit: recovered by the search, or
             not healthy; then its pose is the guess.
         """
-        fit = self.fit(sweep, guess, prior)
         usual = float(np.median(self._fitness)) if self._fitness else 0.0
         limit = max(self.settings.min_fitness, self.settings.min_fitness_ratio * usual)
-        if fit.matches.fitness >= max(limit, _DOUBTFUL * usual):
+        doubtful = max(limit, _DOUBTFUL * usual)
+        brief = self.settings.polish and self.sweeps >= _RECENT
+        fit = self.fit(sweep, guess, prior, brief=brief)
+        if brief and fit.matches.fitness < doubtful:
+            fit = self._once_more(sweep, fit, guess, prior, doubtful)
+        if fit.matches.fitness >= doubtful:
+            self._searched = 1.0
+            return sweep, fit
+        if limit <= fit.matches.fitness >= self._searched:
             return sweep, fit
         reason = f'{fit.matches.fitness:.0%} of the points fit the map, usual are {usual:.0%}'
         centres = [T_odom_last, guess]
@@ -194,6 +204,7 @@ class SweepRegistration:
             reason += f'; found by a search over headings ({found.matches.fitness:.0%})'
             return found_sweep, replace(found, reason=reason, recovered=True)
         if fit.matches.fitness >= limit:
+            self._searched = _NEW * fit.matches.fitness
             return sweep, fit
         return sweep, replace(fit, T_odom_middle=guess, reason=reason, healthy=False)
 
@@ -214,6 +225,18 @@ class SweepRegistration:
     def _add_surfaces(self, points: Array, T: Array) -> None:
         self._surfaces.add(np.asarray(se3.transform_points(T, points)), T[:3, 3])
         self.sweeps += 1
+
+    def _once_more(
+        self, sweep: Sweep, fit: Fit, guess: Array, prior: Array, doubtful: float
+    ) -> Fit:
+        """Register anew from a turn that began or ended, and else as long as it takes."""
+        turned = yaw_candidates(sweep.sample, [guess], self._surfaces, 1, _TURNS, _TURN_SPAN)[0]
+        if se3.distance(guess, turned)[1] > 1e-6:
+            again = self.fit(sweep, turned, prior, brief=True)
+            fit = max(fit, again, key=lambda one: one.matches.fitness)
+        if fit.matches.fitness >= doubtful:
+            return fit
+        return self.fit(sweep, fit.T_odom_middle, prior)
 
     def _search(self, sweep: Sweep, centres: list[Array], prior: Array) -> list[tuple[Sweep, Fit]]:
         poses = yaw_candidates(sweep.sample, centres, self._surfaces, _HEADINGS)

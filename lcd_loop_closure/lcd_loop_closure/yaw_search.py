@@ -8,7 +8,12 @@ from lcd_loop_closure.voxel_gaussians import VoxelGaussians
 
 
 def yaw_candidates(
-    points: Array, T_map_centres: list[Array], surfaces: VoxelGaussians, best: int, steps: int = 24
+    points: Array,
+    T_map_centres: list[Array],
+    surfaces: VoxelGaussians,
+    best: int,
+    steps: int = 24,
+    span: float = 2.0 * np.pi,
 ) -> list[Array]:
     """Return the poses under which most points fall where the map has matter, best first.
 
@@ -17,19 +22,21 @@ def yaw_candidates(
         T_map_centres: poses to turn about their own z axes.
         surfaces: the map.
         best: how many to return; neighbours of a better one are left out.
-        steps: headings tried in a full turn.
+        steps: headings tried in the span.
+        span: of the headings, radians, half of it to each side.
     """
+    step = span / steps
     poses = [
         T @ se3.rotation_z(angle)
         for T in T_map_centres
-        for angle in np.arange(steps) * (2.0 * np.pi / steps)
+        for angle in (np.arange(steps) - steps // 2) * step
     ]
     placed = np.concatenate([se3.transform_points(T, points) for T in poses])
     share = (surfaces.find(placed, 2) >= 0).reshape(len(poses), -1).mean(axis=1)
     chosen: list[Array] = []
     for index in np.argsort(-share, kind='stable'):
         T = poses[index]
-        if all(se3.distance(T, other)[1] > 2.5 * np.pi / steps for other in chosen):
+        if all(se3.distance(T, other)[1] > 1.25 * step for other in chosen):
             chosen.append(T)
         if len(chosen) == best:
             break
