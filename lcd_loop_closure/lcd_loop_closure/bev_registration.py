@@ -83,7 +83,7 @@ class BevRegistration:
         # The image wraps around: at this size no shift within reach brings structure back in.
         half = int(np.ceil(s.radius / s.cell)) + self._reach
         self._size = fft.next_fast_len(2 * half + 2, real=True)
-        turns = max(4, round(360.0 / s.yaw_step))
+        turns = 2 * max(2, round(180.0 / s.yaw_step))
         self._yaws = 2.0 * np.pi / turns * np.arange(turns)
 
     def view(self, xyz: NDArray[np.floating]) -> BevView:
@@ -112,14 +112,16 @@ class BevRegistration:
         return BevView(xy[tall].astype(np.float32), weight.astype(np.float32), ground_z)
 
     def spectra(self, query: BevView) -> NDArray[np.complex64]:
-        """Return the spectra [yaws x n x n/2+1] of the query turned to every yaw of the grid.
+        """Return the spectra [yaws/2 x n x n/2+1] of the query turned to the first half of yaws.
 
-        They depend on the query alone; compute them once for all its candidates.
+        Half a turn more is the conjugate. They depend on the query alone; compute them once for all
+        its candidates.
         """
+        yaws = self._yaws[: len(self._yaws) // 2]
         keep = np.hypot(query.xy[:, 0], query.xy[:, 1]) <= self.settings.radius
         xy, weight = query.xy[keep], query.weight[keep]
-        images = np.empty((len(self._yaws), self._size, self._size), np.float32)
-        for image, yaw in zip(images, self._yaws, strict=True):
+        images = np.empty((len(yaws), self._size, self._size), np.float32)
+        for image, yaw in zip(images, yaws, strict=True):
             c, s = np.cos(yaw), np.sin(yaw)
             turned = xy @ np.array([[c, s], [-s, c]], np.float32)
             image[:] = self._image(turned, weight)
@@ -136,7 +138,10 @@ class BevRegistration:
         target = self._image(match.xy, match.weight)
         shifts = np.arange(-self._reach, self._reach + 1)
         # Only shifts within reach are transformed back, first rows, then columns.
-        product = fft.rfft2(target) * np.conj(spectra)
+        spectrum, half = fft.rfft2(target), len(spectra)
+        product = np.empty((2 * half, *spectrum.shape), np.complex64)
+        np.multiply(spectrum, np.conj(spectra), out=product[:half])
+        np.multiply(spectrum, spectra, out=product[half:])
         rows = fft.ifft(product, axis=1, overwrite_x=True)[:, shifts]
         volume = fft.irfft(rows, n=self._size, axis=2)[:, :, shifts]
         norm = float(np.linalg.norm(target) * np.sqrt(np.sum(query.weight**2)))

@@ -15,6 +15,7 @@ from lcd_loop_closure.bev_registration import BevConfig
 from lcd_loop_closure.descriptor_index import DescriptorIndex
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint, LoopStatus
+from lcd_loop_closure.odometry_reach import OdometryReach
 from lcd_loop_closure.pair_registration import (
     PairConfig,
     PairRegistration,
@@ -46,6 +47,16 @@ class LoopDetectorConfig:
     )
     spread: float = setting(
         10.0, 'candidates are at least this far apart along the path', unit='m', low=0.0
+    )
+    max_drift: float = setting(
+        0.3, 'how wrong odometry may be, as a share of the distance driven in between', low=0.0
+    )
+    trusted_travel: float = setting(
+        100.0,
+        'candidates too far away by odometry and its max_drift are not tried when less than this '
+        'was driven in between, and one for each keyframe otherwise',
+        unit='m',
+        low=0.0,
     )
     cached_clouds: int = setting(16, 'matches kept ready for registration', low=1)
 
@@ -123,6 +134,9 @@ class LoopDetector:
         self._travelled_m: dict[int, float] = {}
         self._restored: set[int] = set()
         self._path_m = 0.0
+        self._reach = OdometryReach(
+            self.settings.detector.max_drift, self.settings.verification.max_distance
+        )
         self._index.clear()
         self._ready: OrderedDict[int, PreparedCloud] = OrderedDict()
 
@@ -166,6 +180,7 @@ class LoopDetector:
         self._keyframes.pop(id, None)
         self._travelled_m.pop(id, None)
         self._restored.discard(id)
+        self._reach.forget(id)
         self._ready.pop(id, None)
         self._index.remove(id)
 
@@ -184,6 +199,7 @@ class LoopDetector:
             with the first accepted one.
         """
         keyframe = self._arrive(keyframe)
+        self._reach.arrive(keyframe, self._path_m)
         with self._timer('retrieve'):
             candidates = self._candidates(keyframe, graph)
         loops = self._try(keyframe, candidates)
@@ -192,7 +208,9 @@ class LoopDetector:
 
     def remember(self, keyframe: Keyframe) -> None:
         """Take in a keyframe without looking for loops."""
-        self._remember(self._arrive(keyframe))
+        keyframe = self._arrive(keyframe)
+        self._reach.arrive(keyframe, self._path_m)
+        self._remember(keyframe)
 
     def compare(self, match: Keyframe, query: Keyframe) -> LoopConstraint:
         """Register and verify one pair of keyframes, whatever retrieval says of them."""
@@ -216,6 +234,7 @@ class LoopDetector:
         assert keyframe.descriptor is not None
         if keyframe.id in self._keyframes:
             self.forget(keyframe.id)
+            self._reach.arrive(keyframe, self._path_m)
         self._keyframes[keyframe.id] = keyframe
         self._travelled_m[keyframe.id] = self._path_m
         if restored:
@@ -245,10 +264,17 @@ class LoopDetector:
             near = self._radius.nearest(query, self._keyframes, eligible, graph, wanted)
             by_radius = [_Candidate(keyframe.id, 'radius') for keyframe in near]
         chosen: list[_Candidate] = []
+        unlikely = 0
         for pair in zip_longest(by_radius, by_descriptor):
             for candidate in pair:
-                if candidate is not None and self._elsewhere(candidate, chosen):
-                    chosen.append(candidate)
+                if candidate is None or not self._elsewhere(candidate, chosen):
+                    continue
+                if not self._reach.plausible(candidate.id, query.id):
+                    driven_m = self._path_m - self._travelled_m[candidate.id]
+                    if unlikely or driven_m < s.trusted_travel:
+                        continue
+                    unlikely += 1
+                chosen.append(candidate)
         return chosen[: s.max_candidates]
 
     def _elsewhere(self, candidate: _Candidate, chosen: list[_Candidate]) -> bool:

@@ -49,7 +49,7 @@ class PreparedCloud:
 
     @cached_property
     def spectra(self) -> NDArray[np.complex64]:
-        """Spectra of the view from above, turned to all yaws (12 MB, of the query alone)."""
+        """Spectra of the view from above, turned (6 MB, of the query alone)."""
         return self._stages.registration.spectra(self.bev)
 
     @cached_property

@@ -5,6 +5,7 @@ same clouds give the same pose to the last bit.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import small_gicp
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.settings import config, setting
+
+
+_ROUGH_ITERATIONS = 15  # the right answer takes five
 
 
 @config
@@ -24,7 +28,7 @@ class RefinementConfig:
         2.0, 'largest distance of partners in the rough pass', unit='m', low=0.1
     )
     gate: float = setting(0.8, 'largest distance of partners in the last pass', unit='m', low=0.05)
-    max_iterations: int = setting(30, 'of each pass', low=1)
+    max_iterations: int = setting(30, 'of the last pass', low=1)
     patch: float = setting(
         5.0, 'residuals within patches of this size count as dependent', unit='m', low=0.1
     )
@@ -48,6 +52,11 @@ class Surface:
     xyz: NDArray[np.float64]
     rough_points: small_gicp.PointCloud
     rough_tree: small_gicp.KdTree
+
+    @cached_property
+    def covariances(self) -> NDArray[np.float64]:
+        """Covariance of the surface at each point [N x 3 x 3]."""
+        return np.ascontiguousarray(np.asarray(self.points.covs())[:, :3, :3])
 
     def nearest(self, xyz: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the index [N] of the nearest point to each of [N x 3] and its distance, metres."""
@@ -93,7 +102,7 @@ class Refinement:
             T_match_query,
             max_correspondence_distance=s.rough_gate,
             num_threads=1,
-            max_iterations=s.max_iterations,
+            max_iterations=_ROUGH_ITERATIONS,
             rotation_epsilon=0.005,
             translation_epsilon=0.02,
         )
@@ -133,18 +142,17 @@ class Refinement:
             return None
         p, moved, index = p_query[near], moved[near], index[near]
         # In the query's axes, where d(exp(xi) p) / d xi = [I, -hat(p)].
-        spread = np.asarray(query.points.covs())[near, :3, :3]
-        spread = spread + R.T @ np.asarray(match.points.covs())[index, :3, :3] @ R
+        spread = query.covariances[near] + R.T @ match.covariances[index] @ R
         weight = _inverse_3x3(spread)
         residual = (match.xyz[index] - moved) @ R
-        pull = np.einsum('nij,nj->ni', weight, residual)
-        gradient = np.hstack([pull, np.cross(p, pull)])
-        turned = np.cross(p[:, None, :], weight)  # hat(p) @ weight, row by row of weight
-        H = np.empty((6, 6))
-        H[:3, :3] = weight.sum(axis=0)
-        H[:3, 3:] = turned.sum(axis=0)
-        H[3:, :3] = H[:3, 3:].T
-        H[3:, 3:] = np.cross(p[:, :, None], turned, axis=1).sum(axis=0)
+        jacobian = np.zeros((len(p), 3, 6))
+        jacobian[:, :, :3] = np.eye(3)
+        jacobian[:, 0, 4], jacobian[:, 0, 5] = p[:, 2], -p[:, 1]
+        jacobian[:, 1, 3], jacobian[:, 1, 5] = -p[:, 2], p[:, 0]
+        jacobian[:, 2, 3], jacobian[:, 2, 4] = p[:, 1], -p[:, 0]
+        weighted = weight @ jacobian
+        gradient = np.einsum('nij,ni->nj', weighted, residual)
+        H = jacobian.reshape(-1, 6).T @ weighted.reshape(-1, 6)
         patch = _patches(moved, s.patch)
         order = np.argsort(patch, kind='stable')
         start = np.flatnonzero(np.r_[True, np.diff(patch[order]) > 0])

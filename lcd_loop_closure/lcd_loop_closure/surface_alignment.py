@@ -75,8 +75,7 @@ def match_surfaces(
     index = np.nonzero(slots >= 0)[0]
     map_ = surfaces.gaussians(slots[index])
     offset = placed[index] - map_.mean
-    variance, axes = np.linalg.eigh(map_.covariance)
-    variance = np.maximum(variance, 0.0)
+    variance, axes = map_.variance, map_.axes
     thin = (_THIN * surfaces.voxel_size) ** 2
     flat = (variance[:, 0] < thin) & (variance[:, 1] > thin)
     upright = np.abs(axes[:, :, 2] @ R[:, 2]) > _STEEP

@@ -53,12 +53,14 @@ class Fit:
         T_odom_middle: pose of the lidar in the middle of the sweep.
         matches: with the surfaces, at the pose.
         disagreement: [6] twist from KISS-ICP's pose to that on the surfaces; zero where it is none.
+        surprised: the motion changed too abruptly to tell how well motions are guessed.
         healthy, recovered, reason: as of OdometryEstimate.
     """
 
     T_odom_middle: Array
     matches: SurfaceMatches
     disagreement: Array = field(default_factory=lambda: np.zeros(6))
+    surprised: bool = False
     healthy: bool = True
     recovered: bool = False
     reason: str = ''
@@ -188,6 +190,7 @@ class SweepRegistration:
         fit = self.fit(sweep, guess, prior, brief=brief)
         if brief and fit.matches.fitness < doubtful:
             fit = self._once_more(sweep, fit, guess, prior, doubtful)
+            fit = replace(fit, surprised=True)
         if fit.matches.fitness >= doubtful:
             self._searched = 1.0
             return sweep, fit
@@ -216,7 +219,8 @@ class SweepRegistration:
 
     def accept(self, sweep: Sweep, fit: Fit, guess: Array) -> None:
         """Let a well registered sweep into the map."""
-        if not fit.recovered:  # a search says nothing about how well motions are guessed
+        if not fit.recovered and not fit.surprised:
+            # KISS-ICP looks for partners as far as guesses were ever off, which slows it for good.
             self._kiss.note_deviation(guess, fit.T_odom_middle)
         self._kiss.add(sweep.dense, fit.T_odom_middle)
         self._add_surfaces(sweep.dense, fit.T_odom_middle)

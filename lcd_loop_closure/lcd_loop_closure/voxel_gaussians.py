@@ -15,11 +15,19 @@ _UNFOLD = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Points of K voxels, map frame: count [K], mean [K x 3], covariance [K x 3 x 3] (metres)."""
+    """Points of K voxels, map frame, metres.
+
+    Attributes:
+        count: [K] points.
+        mean: [K x 3].
+        variance: [K x 3] along the axes, the smallest first.
+        axes: [K x 3 x 3] unit eigenvectors of the covariance, one a column.
+    """
 
     count: Array
     mean: Array
-    covariance: Array
+    variance: Array
+    axes: Array
 
 
 class VoxelGaussians:
@@ -39,6 +47,9 @@ class VoxelGaussians:
         # Per slot: the voxel's corner, and the sums of the points' offsets and their products.
         self._corner, self._sum = np.zeros((0, 3)), np.zeros((0, 3))
         self._moment = np.zeros((0, 6))
+        # What `gaussians` makes of them, where `_fresh`: registration asks again and again.
+        self._fresh = np.zeros(0, bool)
+        self._variance, self._axes = np.zeros((0, 3)), np.zeros((0, 3, 3))
 
     def __len__(self) -> int:
         return len(self._slot)
@@ -51,6 +62,7 @@ class VoxelGaussians:
         self._open(keys[slots < 0], slots)
         point_slot = slots[point_key]
         use = self._count[point_slot] < self.full_at
+        self._fresh[point_slot[use]] = False
         point_slot, corner = point_slot[use], cells[use] * self.voxel_size
         # Offsets from the voxel's corner: small numbers, so that the moments do not cancel.
         offset = points[use] - corner
@@ -73,17 +85,25 @@ class VoxelGaussians:
 
     def gaussians(self, slots: NDArray[np.int64]) -> Gaussians:
         """Return the Gaussians of the given voxels; each must hold at least two points."""
+        self._refresh(np.unique(slots[~self._fresh[slots]]))
+        count = self._count[slots]
+        mean = self._sum[slots] / count[:, None] + self._corner[slots]
+        return Gaussians(count, mean, self._variance[slots], self._axes[slots])
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.__init__(self.voxel_size, self.max_range, self.full_at)  # type: ignore[misc]
+
+    def _refresh(self, slots: NDArray[np.int64]) -> None:
         count = self._count[slots]
         mean = self._sum[slots] / count[:, None]
         moment = (self._moment[slots] / count[:, None])[:, _UNFOLD].reshape(-1, 3, 3)
         covariance = moment - mean[:, :, None] * mean[:, None, :]
         # Unbiased: a voxel of few points is no thinner than they can tell.
         covariance *= (count / (count - 1))[:, None, None]
-        return Gaussians(count, mean + self._corner[slots], covariance)
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self.__init__(self.voxel_size, self.max_range, self.full_at)  # type: ignore[misc]
+        variance, self._axes[slots] = np.linalg.eigh(covariance)
+        self._variance[slots] = np.maximum(variance, 0.0)
+        self._fresh[slots] = True
 
     def _slots(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         find = self._slot.get
@@ -104,6 +124,9 @@ class VoxelGaussians:
         self._corner = np.concatenate([self._corner, np.zeros((amount, 3))])
         self._sum = np.concatenate([self._sum, np.zeros((amount, 3))])
         self._moment = np.concatenate([self._moment, np.zeros((amount, 6))])
+        self._fresh = np.concatenate([self._fresh, np.zeros(amount, bool)])
+        self._variance = np.concatenate([self._variance, np.zeros((amount, 3))])
+        self._axes = np.concatenate([self._axes, np.zeros((amount, 3, 3))])
         self._free += range(old + amount - 1, old - 1, -1)
 
     def _forget(self, origin: Array) -> None:
@@ -113,6 +136,7 @@ class VoxelGaussians:
         for key in _pack(np.round(self._corner[far] / self.voxel_size)).tolist():
             del self._slot[key]
         self._count[far], self._sum[far], self._moment[far] = 0.0, 0.0, 0.0
+        self._fresh[far] = False
         self._free += far.tolist()
 
 

@@ -25,7 +25,8 @@ def test_moments_are_those_of_the_points() -> None:
         found = grid.gaussians(grid.find(inside[:1]))
         assert found.count[0] == len(inside)
         np.testing.assert_allclose(found.mean[0], inside.mean(axis=0), atol=1e-9)
-        np.testing.assert_allclose(found.covariance[0], np.cov(inside.T), atol=1e-9)
+        covariance = (found.axes[0] * found.variance[0]) @ found.axes[0].T
+        np.testing.assert_allclose(covariance, np.cov(inside.T), atol=1e-9)
 
 
 def test_unknown_and_thin_voxels_are_not_found() -> None:

@@ -54,14 +54,20 @@ class GraphJudge:
             name=f'{node.get_name()} judge',
         )
 
-    def consider(self, graph: PoseGraph) -> None:
-        """Have a graph judged when loops came that nobody has judged; one at a time."""
+    def consider(self, graph: PoseGraph) -> bool:
+        """Have a graph judged when loops came that nobody has judged; one at a time.
+
+        Returns:
+            Whether a solve was asked for.
+        """
         if not graph.needs_verdict or not self._worker.idle() or self._ready:
-            return
+            return False
         snapshot = graph.snapshot()
-        if self._asked != (graph, snapshot.arrivals):
-            self._asked = graph, snapshot.arrivals
-            self._worker.put((graph, snapshot))
+        if self._asked == (graph, snapshot.arrivals):
+            return False
+        self._asked = graph, snapshot.arrivals
+        self._worker.put((graph, snapshot))
+        return True
 
     def hand_over(self) -> None:
         """Hand over the verdicts that are ready, on the caller's thread."""

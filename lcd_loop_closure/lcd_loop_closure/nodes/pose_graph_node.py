@@ -85,6 +85,9 @@ class PoseGraphNodeConfig:
     on_time_jump: str = setting(
         'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
     )
+    judge_period: float = setting(
+        1.0, 'shortest time between two joint verdicts on the loops', unit='s', low=0.0
+    )
     solver_niceness: int = setting(
         10, 'lower priority of the process that judges the loops', low=0, high=19
     )
@@ -146,7 +149,7 @@ class PoseGraphNode(Node):
         self.paused = False
         self.base_frame = 'base_link'
         self._odometry: StampedPose | None = None
-        self._shown_s = self._mapped_s = -math.inf
+        self._shown_s = self._mapped_s = self._judged_s = -math.inf
         self._undrawn = self._unmapped = False
 
         self._path_out = self.create_publisher(Path, 'path', qos.LATCHED)
@@ -264,7 +267,7 @@ class PoseGraphNode(Node):
         with self.diagnostics.stage('graph update'):
             self.map.graph.update()
         self.publish_graph()
-        self._judge.consider(self.map.graph)
+        self._have_judged()
         self._show()
 
     def publish_graph(self) -> None:
@@ -281,6 +284,7 @@ class PoseGraphNode(Node):
     def refresh(self) -> None:
         """Show what was held back, and say whether map -> odom has another owner."""
         self._judge.hand_over()
+        self._have_judged(now=not self.config.threaded)
         self._show(all_of_it=not self.config.threaded)
         self._pose.check_authority()
 
@@ -360,6 +364,11 @@ class PoseGraphNode(Node):
         due = all_of_it or now_s - self._shown_s >= self.config.display_period
         if map_due or (self._undrawn and due):
             self.show(map_cloud=map_due)
+
+    def _have_judged(self, *, now: bool = False) -> None:
+        if now or self._now_s() - self._judged_s >= self.config.judge_period:
+            if self._judge.consider(self.map.graph):
+                self._judged_s = self._now_s()
 
     def _now_s(self) -> float:
         """Return wall time, or in lock-step the newest keyframe's, so that runs repeat."""
