@@ -18,6 +18,7 @@ from lcd_common import se3
 from lcd_common.se3 import Array
 
 _ROUGH_ITERATIONS = 30
+_BRIEF_ITERATIONS = 12
 # Norm of the last step, metres and radians; KISS-ICP's own is 1e-4.
 _BRIEF_CONVERGENCE = 1e-2
 
@@ -49,7 +50,7 @@ class KissRegistration:
         self._rough_registration = get_registration(rough)
         brief = self._config.model_copy(deep=True)
         brief.registration.convergence_criterion = _BRIEF_CONVERGENCE
-        brief.registration.max_num_iterations = _ROUGH_ITERATIONS
+        brief.registration.max_num_iterations = _BRIEF_ITERATIONS
         self._brief_registration = get_registration(brief)
         self.clear()
 

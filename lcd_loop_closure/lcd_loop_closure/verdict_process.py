@@ -33,12 +33,16 @@ class SolverProcessError(LocalizationError):
 
 
 class VerdictProcess:
-    """Run a RobustSolver in a child process, started with the first solve. Not thread-safe."""
+    """Run a RobustSolver in a child process, which the first solve starts. Not thread-safe."""
 
     def __init__(self, settings: RobustSolverConfig, niceness: int = 5) -> None:
         """Remember the settings; `niceness` lowers the child's priority."""
         self._settings, self._niceness = settings, niceness
         self._child: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start the child now, as its first seconds (imports) are busy ones."""
+        self._running()
 
     def solve(self, snapshot: GraphSnapshot) -> Verdict:
         """Return the verdict on a snapshot.

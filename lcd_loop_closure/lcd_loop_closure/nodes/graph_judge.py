@@ -40,6 +40,8 @@ class GraphJudge:
         """
         self._threaded, self._on_verdict, self._stopping = threaded, on_verdict, False
         self._process = VerdictProcess(settings, niceness) if threaded else None
+        if self._process is not None:
+            self._process.start()
         solver = self._process or RobustSolver(settings)
         self._solve = solver.solve
         self._ready: list[tuple[PoseGraph, Verdict]] = []
