@@ -91,6 +91,7 @@ class LidarOdometry:
         self._unsteady = UnsteadyMotion()
         self._disagreement: Array | None = None
         self._lost = 0
+        self._located: tuple[Sweep, Fit, Array] | None = None
         self._registration.clear()
 
     def local_map(self) -> Array:
@@ -98,12 +99,29 @@ class LidarOdometry:
         return self._registration.points()
 
     def register(self, cloud: PointCloud, stamp_ns: int) -> OdometryEstimate:
-        """Register a sweep, given in the lidar's frame.
+        """Locate a sweep, given in the lidar's frame, and take it into the map.
 
         Raises:
             DataError: the stamp is not after the last one, or too few points are usable. The
                 odometry stays as it was.
         """
+        estimate = self.locate(cloud, stamp_ns)
+        self.absorb()
+        return estimate
+
+    def absorb(self) -> None:
+        """Take the sweep that was located last into the map, if that is still to be done."""
+        located, self._located = self._located, None
+        if located is not None:
+            self._registration.accept(*located)
+
+    def locate(self, cloud: PointCloud, stamp_ns: int) -> OdometryEstimate:
+        """Say where a sweep was taken, before the time that `absorb` takes.
+
+        Raises:
+            DataError: as `register`.
+        """
+        self.absorb()
         if self._stamp_ns is None:
             return self._begin(cloud, stamp_ns, np.zeros(6))
         if stamp_ns <= self._stamp_ns:
@@ -175,7 +193,7 @@ class LidarOdometry:
             self._twist = motion / step_s
             self._twist_at_middle = self._unsteady.at_middle(motion, change) / step_s
             self._unsteady.take(change, steady=not fit.recovered)
-            self._registration.accept(sweep, fit, guess)
+            self._located = sweep, fit, guess
             self._lost = 0
         else:
             fit = self._lose(sweep, fit)

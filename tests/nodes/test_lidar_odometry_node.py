@@ -138,13 +138,13 @@ def test_a_second_authority_is_an_error(make: Make) -> None:
 def test_covariances_are_those_of_the_motions(make: Make) -> None:
     fed = Fed(make(LidarOdometryNode, threaded=False))
     estimates = []
-    register = fed.node._odometry.register
+    locate = fed.node._odometry.locate
 
     def noted(cloud: PointCloud, stamp: int) -> Any:
-        estimates.append(register(cloud, stamp))
+        estimates.append(locate(cloud, stamp))
         return estimates[-1]
 
-    fed.node._odometry.register = noted
+    fed.node._odometry.locate = noted
     for sweep in sweeps():
         fed.feed(sweep.message())
     to_base = se3.adjoint(T_BASE_LIDAR)
@@ -277,14 +277,14 @@ def test_the_queue_drops_the_oldest_and_counts(make: Make, spin_until: Callable[
     node = make(LidarOdometryNode, waiting_clouds=2)
     node._transforms.on_tf_static(mounting())
     gate, begun = threading.Event(), threading.Event()
-    register = node._odometry.register
+    locate = node._odometry.locate
 
     def slow(cloud: PointCloud, stamp: int) -> Any:
         begun.set()
         assert gate.wait(20.0)
-        return register(cloud, stamp)
+        return locate(cloud, stamp)
 
-    node._odometry.register = slow
+    node._odometry.locate = slow
     got: list[int] = []
     node._odom_out.publish = lambda m: got.append(messages.stamp_ns(m.header.stamp))
     node.on_points(sweeps()[0].message())

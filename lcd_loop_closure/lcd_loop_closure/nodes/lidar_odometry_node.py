@@ -139,7 +139,7 @@ class LidarOdometryNode(Node):
                 cloud = messages.cloud_from_message(scan.points)
                 finite = cloud.finite()
             with self.diagnostics.stage('registration'):
-                estimate = self._odometry.register(finite, stamp_ns)
+                estimate = self._odometry.locate(finite, stamp_ns)
         except DataError as error:
             self._reject('unusable cloud', str(error))
             return
@@ -147,6 +147,8 @@ class LidarOdometryNode(Node):
             self.diagnostics.count('points without coordinates (NaN)', len(cloud) - len(finite))
         with self.diagnostics.stage('publish'):
             self._publish(estimate, T_base_lidar)
+        with self.diagnostics.stage('map'):
+            self._odometry.absorb()
         self._tell(estimate)
 
     def _mounting(self, frame_id: str) -> se3.Array | None:
