@@ -13,6 +13,7 @@ from lcd_loop_closure.graph_snapshot import IN_GRAPH, GraphLoop, LoopKey, LoopSt
 from lcd_loop_closure.imu_tie import ImuTie
 from lcd_loop_closure.incremental_solver import IncrementalConfig, IncrementalSolver
 from lcd_loop_closure.loop_ledger import LoopLedger
+from lcd_loop_closure.neighbouring_loop import covariance_by_neighbour
 from lcd_loop_closure.odometry_chain import OdometryChain
 
 _log = logging.getLogger(__name__)
@@ -154,27 +155,49 @@ class GraphFactors:
         """Return the 6x6 of a pose, body axes, translation first."""
         return self._solver.pose_covariance(row)
 
-    def relative(self, first: int, second: int) -> tuple[se3.Array, se3.Array]:
-        """Return T_first_second as estimated and its 6x6 (body axes, translation first).
+    def relative_pose(self, first: int, second: int) -> se3.Array:
+        """Return T_first_second as estimated.
 
         Rows still to be taken in count too; their part is odometry's, which is what a step would
         make of it.
         """
         if first > second:
-            T, covariance = self.relative(second, first)
-            return se3.inverse(T), se3.invert_covariance(T, covariance)
+            return se3.inverse(self.relative_pose(second, first))
         if first >= len(self._solver):
             self.step()
         last = min(second, len(self._solver) - 1)
-        T, covariance = np.eye(4), np.zeros((6, 6))
+        T = np.eye(4)
         if first < last:
             T = se3.inverse(self._solver.pose(first)) @ self._solver.pose(last)
+        for row in range(last + 1, second + 1):
+            T = T @ self._odometry.motions[row]
+        return T
+
+    def loop_covariance(self, key: LoopKey) -> se3.Array:
+        """Return the 6x6 of the relative pose that a loop measures, or a bound by a near loop."""
+        bound = covariance_by_neighbour(self._ledger, self._odometry, self.broken_rows, key)
+        if bound is not None:
+            return bound
+        return self.relative_covariance(*(self._odometry.row(i) for i in key))
+
+    def relative_covariance(self, first: int, second: int) -> se3.Array:
+        """Return the 6x6 of `relative_pose`, body axes of the second, translation first."""
+        if first > second:
+            T, covariance = (
+                self.relative_pose(second, first),
+                self.relative_covariance(second, first),
+            )
+            return se3.invert_covariance(T, covariance)
+        if first >= len(self._solver):
+            self.step()
+        last = min(second, len(self._solver) - 1)
+        covariance = np.zeros((6, 6))
+        if first < last:
             covariance = self._solver.relative_covariance(first, last)
         for row in range(last + 1, second + 1):
             motion, noise = self._odometry.motions[row], self._odometry.covariances[row]
             covariance = se3.compose_covariance(covariance, motion, noise)
-            T = T @ motion
-        return T, covariance
+        return covariance
 
     def _last_known(self) -> se3.Array:
         known = len(self._solver)

@@ -26,7 +26,7 @@ class IncrementalConfig:
         0.05, 'a pose that turned farther is linearized anew', unit='rad', low=1e-6
     )
     wildfire: float = setting(
-        1e-3, 'changes smaller than this (m, rad) are not carried further', low=0.0
+        3e-3, 'changes smaller than this (m, rad) are not carried further', low=0.0
     )
 
 

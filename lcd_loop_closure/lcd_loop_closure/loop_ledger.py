@@ -22,11 +22,14 @@ class LoopLedger:
 
     def __init__(self) -> None:
         self._loops: dict[LoopKey, GraphLoop] = {}
+        self._of_query: dict[int, list[LoopKey]] = {}
         self.arrivals = 0
 
     def restore(self, loops: tuple[GraphLoop, ...], arrivals: int) -> None:
         """Hold these loops instead."""
-        self._loops = {loop.key: loop for loop in loops}
+        self._loops, self._of_query = {}, {}
+        for loop in loops:
+            self._put(loop)
         self.arrivals = arrivals
 
     def __contains__(self, key: LoopKey) -> bool:
@@ -44,9 +47,17 @@ class LoopLedger:
     def add(self, constraint: LoopConstraint, covariance: se3.Array, state: LoopState) -> None:
         """Remember a loop that arrives, last in order."""
         loop = GraphLoop(constraint, covariance, state, self.arrivals)
-        self._loops.pop(loop.key, None)
-        self._loops[loop.key] = loop
+        self._put(loop)
         self.arrivals += 1
+
+    def of_query(self, keyframe_id: int) -> list[GraphLoop]:
+        """Return the loops that this keyframe closed."""
+        return [self._loops[key] for key in self._of_query.get(keyframe_id, [])]
+
+    def _put(self, loop: GraphLoop) -> None:
+        if self._loops.pop(loop.key, None) is None:
+            self._of_query.setdefault(loop.key[1], []).append(loop.key)
+        self._loops[loop.key] = loop
 
     def decide(self, key: LoopKey, state: LoopState, reason: str = '') -> None:
         """Change what the graph does with a loop, and say so in its constraint."""

@@ -323,8 +323,9 @@ class PoseGraph:
             loop = self._ledger[key]
             shift_m, against = np.inf, ''
             if loop.state is not LoopState.BY_HAND:
-                rows = (self._odometry.row(i) for i in key)
-                shift_m, against = self._admission.objection(loop, *self._factors.relative(*rows))
+                rows = [self._odometry.row(i) for i in key]
+                estimate = self._factors.relative_pose(*rows), self._factors.loop_covariance(key)
+                shift_m, against = self._admission.objection(loop, *estimate)
             if against:
                 self._ledger.decide(key, LoopState.HELD, f'{against}; waits for the solver')
                 held.append(key)

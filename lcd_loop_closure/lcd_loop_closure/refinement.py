@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from lcd_common import se3
 from lcd_common.settings import config, setting
 
-
 _ROUGH_ITERATIONS = 15  # the right answer takes five
 
 

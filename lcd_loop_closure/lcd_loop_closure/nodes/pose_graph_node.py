@@ -366,9 +366,9 @@ class PoseGraphNode(Node):
             self.show(map_cloud=map_due)
 
     def _have_judged(self, *, now: bool = False) -> None:
-        if now or self._now_s() - self._judged_s >= self.config.judge_period:
-            if self._judge.consider(self.map.graph):
-                self._judged_s = self._now_s()
+        due = now or self._now_s() - self._judged_s >= self.config.judge_period
+        if due and self._judge.consider(self.map.graph):
+            self._judged_s = self._now_s()
 
     def _now_s(self) -> float:
         """Return wall time, or in lock-step the newest keyframe's, so that runs repeat."""
