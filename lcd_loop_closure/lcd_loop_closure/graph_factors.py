@@ -173,9 +173,20 @@ class GraphFactors:
             T = T @ self._odometry.motions[row]
         return T
 
+    def doubt(self, loop: GraphLoop) -> float:
+        """Return by how much the kernel widens a loop's covariance at the estimate; 1: not."""
+        if loop.state is not LoopState.TENTATIVE:
+            return 1.0
+        estimate = self.relative_pose(*(self._odometry.row(i) for i in loop.key))
+        error = se3.log(se3.inverse(loop.T_match_query) @ estimate)
+        squared = float(error @ np.linalg.solve(loop.covariance, error))
+        return 1.0 + squared / self._kernel**2
+
     def loop_covariance(self, key: LoopKey) -> se3.Array:
         """Return the 6x6 of the relative pose that a loop measures, or a bound by a near loop."""
-        bound = covariance_by_neighbour(self._ledger, self._odometry, self.broken_rows, key)
+        bound = covariance_by_neighbour(
+            self._ledger, self._odometry, self.broken_rows, key, self.doubt
+        )
         if bound is not None:
             return bound
         return self.relative_covariance(*(self._odometry.row(i) for i in key))

@@ -1,28 +1,29 @@
 """How sure the graph is of a relative pose beside which it already holds a loop."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 
 from lcd_common import se3
-from lcd_loop_closure.graph_snapshot import IN_GRAPH, GraphLoop, LoopKey, LoopState
+from lcd_loop_closure.graph_snapshot import IN_GRAPH, GraphLoop, LoopKey
 from lcd_loop_closure.loop_ledger import LoopLedger
 from lcd_loop_closure.odometry_chain import OdometryChain
 
 _REACH = 10  # keyframes along the path; so near, odometry adds little to a loop's own covariance
 
-# A robust kernel takes weight from what stands behind it; twice the sigma is more than it takes.
-_KERNEL = 4.0
-
 
 def covariance_by_neighbour(
-    ledger: LoopLedger, odometry: OdometryChain, broken_rows: Collection[int], key: LoopKey
+    ledger: LoopLedger,
+    odometry: OdometryChain,
+    broken_rows: Collection[int],
+    key: LoopKey,
+    doubt: Callable[[GraphLoop], float],
 ) -> se3.Array | None:
     """Return a 6x6 bound of T_match_query's covariance, body axes, or None without a neighbour.
 
     The way goes by odometry to the other loop's match, along that loop and by odometry to the
     query. The estimate is at least as sure, and its own marginal costs twenty milliseconds on ten
-    thousand poses.
+    thousand poses. `doubt` tells by how much a robust kernel widens a loop's covariance.
     """
     match, query = (odometry.row(i) for i in key)
     neighbour = _neighbour(ledger, odometry, broken_rows, match, query)
@@ -32,8 +33,7 @@ def covariance_by_neighbour(
     covariance = _along(odometry, match, near_match)[1]
     constraint = neighbour.constraint
     assert constraint.T_match_query is not None
-    behind_kernel = neighbour.state is LoopState.TENTATIVE
-    measured = neighbour.covariance * (_KERNEL if behind_kernel else 1.0)
+    measured = doubt(neighbour) * neighbour.covariance
     covariance = se3.compose_covariance(covariance, constraint.T_match_query, measured)
     return se3.compose_covariance(covariance, *_along(odometry, near_query, query))
 

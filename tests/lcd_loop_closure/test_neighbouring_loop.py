@@ -36,7 +36,7 @@ def test_the_bound_is_no_smaller_than_the_marginal(graph: PoseGraph) -> None:
     assert len(loops) > 20
     for match, query in loops[::5]:
         key = (match + 2, query + 3)
-        bound = covariance_by_neighbour(*parts(graph), key)
+        bound = covariance_by_neighbour(*parts(graph), key, graph._factors.doubt)
         assert bound is not None and se3.is_covariance(bound)
         rows = (graph._odometry.row(i) for i in key)
         marginal = graph._factors.relative_covariance(*rows)
@@ -47,18 +47,21 @@ def test_the_bound_is_no_smaller_than_the_marginal(graph: PoseGraph) -> None:
 def test_on_the_loop_itself_the_bound_is_its_covariance(graph: PoseGraph) -> None:
     loop = next(iter(graph._ledger))
     np.testing.assert_allclose(
-        covariance_by_neighbour(*parts(graph), loop.key), 4.0 * loop.covariance, rtol=1e-9
+        covariance_by_neighbour(*parts(graph), loop.key, lambda loop: 2.0),
+        2.0 * loop.covariance,
+        rtol=1e-9,
     )
 
 
 def test_without_a_near_loop_or_across_a_broken_link_there_is_none(graph: PoseGraph) -> None:
     ledger, odometry, _ = parts(graph)
-    assert covariance_by_neighbour(ledger, odometry, (), (0, 1)) is None
+    sure = lambda loop: 1.0  # noqa: E731
+    assert covariance_by_neighbour(ledger, odometry, (), (0, 1), sure) is None
     ids = np.array([loop.key[1] for loop in ledger])
     first = int(ids.min())
     key = next(loop.key for loop in ledger if loop.key[1] == first)
     near = (key[0], first + 1)
-    assert covariance_by_neighbour(ledger, odometry, (), near) is not None
+    assert covariance_by_neighbour(ledger, odometry, (), near, sure) is not None
     if not np.any(ids == first + 1):
         row = odometry.row(first + 1)
-        assert covariance_by_neighbour(ledger, odometry, {row}, near) is None
+        assert covariance_by_neighbour(ledger, odometry, {row}, near, sure) is None
