@@ -23,6 +23,28 @@ class Material(IntEnum):
     WOOD = 8
 
 
+class Label(IntEnum):
+    """What a surface belongs to, by SemanticKITTI's numbers."""
+
+    UNLABELED = 0
+    CAR = 10
+    BICYCLE = 11
+    TRUCK = 18
+    PERSON = 30
+    ROAD = 40
+    PARKING = 44
+    SIDEWALK = 48
+    BUILDING = 50
+    FENCE = 51
+    VEGETATION = 70
+    TRUNK = 71
+    TERRAIN = 72
+    POLE = 80
+    TRAFFIC_SIGN = 81
+    MOVING_CAR = 252
+    MOVING_PERSON = 254
+
+
 # Share of near-infrared light sent back, in the order of Material: plausible, not measured.
 REFLECTIVITY = np.array([0.15, 0.40, 0.60, 0.35, 0.10, 0.70, 0.45, 0.25, 0.50])
 # Share of the rays that come back at all; glass is mostly looked through.
@@ -36,17 +58,20 @@ _BOX_QUADS = np.array(
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of a scene: vertices [V x 3] m, triangles [T x 3], materials [T]."""
+    """Triangles of a scene: vertices [V x 3] m, triangles [T x 3], materials and labels [T]."""
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
     materials: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
 
 
 class MeshBuilder:
-    """Gather shapes and join them once."""
+    """Gather shapes and join them once; `label` is that of the shapes to come."""
 
     def __init__(self) -> None:
+        self.label = Label.UNLABELED
+        self._labels: list[NDArray[np.uint8]] = []
         self._vertices: list[Vertices] = []
         self._triangles: list[NDArray[np.int64]] = []
         self._materials: list[NDArray[np.uint8]] = []
@@ -59,6 +84,7 @@ class MeshBuilder:
         self._vertices.append(vertices)
         self._triangles.append(triangles + self._count)
         self._materials.append(np.full(len(triangles), material, np.uint8))
+        self._labels.append(np.full(len(triangles), self.label, np.uint8))
         self._count += len(vertices)
 
     def quads(self, corners: NDArray[np.float64], material: Material) -> None:
@@ -99,6 +125,7 @@ class MeshBuilder:
             np.concatenate(self._vertices).astype(np.float32),
             np.concatenate(self._triangles).astype(np.uint32),
             np.concatenate(self._materials),
+            np.concatenate(self._labels),
         )
 
 

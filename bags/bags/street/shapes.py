@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.street.mesh import Material, MeshBuilder, turn, up
+from bags.street.mesh import Label, Material, MeshBuilder, turn, up
 
 Array = NDArray[np.float64]
 Quad = list[list[float]]
@@ -13,6 +13,7 @@ def house(
     mesh: MeshBuilder, foot: Array, size: tuple[float, float], yaw: float, rng: np.random.Generator
 ) -> None:
     """Add a house with recessed windows, a roof and, now and then, a bay or a balcony."""
+    mesh.label = Label.BUILDING
     width, depth = size
     storeys = int(rng.integers(1, 5))
     height = 0.8 + storeys * rng.uniform(2.7, 3.3)
@@ -102,6 +103,7 @@ def car(
     mesh: MeshBuilder, foot: Array, size: tuple[float, float], yaw: float, rng: np.random.Generator
 ) -> None:
     """Add a parked car: body, cabin, wheels."""
+    mesh.label = Label.CAR
     length, width = size
     sill, belt = rng.uniform(0.18, 0.35), rng.uniform(0.55, 0.75)
     roof = rng.uniform(0.45, 0.65) if rng.random() < 0.85 else rng.uniform(0.9, 1.3)
@@ -124,7 +126,9 @@ def tree(mesh: MeshBuilder, foot: Array, rng: np.random.Generator) -> None:
     """Add a tree: a trunk, and leaves as loose triangles in an ellipsoid or a cone."""
     height = rng.uniform(3.5, 11.0)
     trunk = rng.uniform(0.2, 0.45) * height
+    mesh.label = Label.TRUNK
     mesh.prism(foot - up(0.3), trunk + 1.0, rng.uniform(0.08, 0.28), Material.BARK)
+    mesh.label = Label.VEGETATION
     radius = rng.uniform(0.9, 2.6)
     count = int(rng.integers(90, 220))
     direction = rng.normal(size=(count, 3))
@@ -141,10 +145,13 @@ def lamp(mesh: MeshBuilder, foot: Array, inward: Array, rng: np.random.Generator
     """Add a street lamp or the post of a traffic sign."""
     if rng.random() < 0.4:
         height = rng.uniform(2.0, 2.8)
+        mesh.label = Label.POLE
         mesh.prism(foot, height, 0.04, Material.METAL)
+        mesh.label = Label.TRAFFIC_SIGN
         yaw = float(rng.uniform(0, np.pi))
         mesh.box(foot + up(height), (0.6, 0.03, rng.uniform(0.3, 0.8)), yaw, Material.METAL)
         return
+    mesh.label = Label.POLE
     height = rng.uniform(4.5, 8.0)
     mesh.prism(foot, height, rng.uniform(0.06, 0.11), Material.METAL)
     yaw = float(np.arctan2(inward[1], inward[0]))
@@ -156,12 +163,14 @@ def fence(
     mesh: MeshBuilder, foot: Array, length: float, yaw: float, rng: np.random.Generator
 ) -> None:
     """Add a garden border: a wall, a hedge or pickets."""
+    mesh.label = Label.FENCE
     kind, height = rng.integers(3), float(rng.uniform(0.7, 1.6))
     R = turn(yaw)
     if kind == 0:
         thick = float(rng.uniform(0.15, 0.35))
         mesh.box(foot + up(height / 2 - 0.2), (length, thick, height + 0.4), yaw, Material.BRICK)
     elif kind == 1:
+        mesh.label = Label.VEGETATION
         count = int(30 * length)
         at = rng.uniform([-length / 2, -0.4, 0.0], [length / 2, 0.4, height], (count, 3)) @ R.T
         leaves = at[:, None] + rng.normal(0.0, 0.12, (count, 3, 3)) + foot

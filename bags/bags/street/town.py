@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bags.street import shapes
-from bags.street.mesh import Material, Mesh, MeshBuilder
+from bags.street.mesh import Label, Material, Mesh, MeshBuilder
 
 Array = NDArray[np.float64]
 # foot of the thing, unit vectors along the street and away from it, the street's yaw -> its length
@@ -201,7 +201,9 @@ class Town:
         )
         vertices = np.column_stack([xy, z])
         green = (away[triangles] > KERB_M + 2.5).all(axis=1)
+        self._mesh.label = Label.TERRAIN
         self._mesh.triangles(vertices, triangles[green], Material.GRASS)
+        self._mesh.label = Label.ROAD
         self._mesh.triangles(vertices, triangles[~green], Material.ASPHALT)
 
 
