@@ -10,12 +10,17 @@ Quad = list[list[float]]
 
 
 def house(
-    mesh: MeshBuilder, foot: Array, size: tuple[float, float], yaw: float, rng: np.random.Generator
+    mesh: MeshBuilder,
+    foot: Array,
+    size: tuple[float, float],
+    yaw: float,
+    rng: np.random.Generator,
+    storeys: int | None = None,
 ) -> None:
     """Add a house with recessed windows, a roof and, now and then, a bay or a balcony."""
     mesh.label = Label.BUILDING
     width, depth = size
-    storeys = int(rng.integers(1, 5))
+    storeys = int(rng.integers(1, 5)) if storeys is None else storeys
     height = 0.8 + storeys * rng.uniform(2.7, 3.3)
     material = Material(rng.choice([Material.PLASTER, Material.BRICK]))
     base = foot - up(1.0)  # the ground may fall along the wall
@@ -122,8 +127,13 @@ def car(
             mesh.box(wheel, (0.6, 0.2, 0.6), yaw, Material.ASPHALT)
 
 
-def tree(mesh: MeshBuilder, foot: Array, rng: np.random.Generator) -> None:
-    """Add a tree: a trunk, and leaves as loose triangles in an ellipsoid or a cone."""
+def tree(
+    mesh: MeshBuilder, foot: Array, rng: np.random.Generator, leaves_mesh: MeshBuilder | None = None
+) -> None:
+    """Add a tree: a trunk, and leaves as loose triangles in an ellipsoid or a cone.
+
+    The leaves go into a mesh of their own where one is given.
+    """
     height = rng.uniform(3.5, 11.0)
     trunk = rng.uniform(0.2, 0.45) * height
     mesh.label = Label.TRUNK
@@ -138,6 +148,8 @@ def tree(mesh: MeshBuilder, foot: Array, rng: np.random.Generator) -> None:
         at[:, :2] *= 0.5 * (1.0 - at[:, 2:])
     crown = at * [radius, radius, (height - trunk) / 2] + up((height + trunk) / 2)
     leaves = crown[:, None] + rng.normal(0.0, 0.22, (count, 3, 3)) + foot
+    mesh = leaves_mesh or mesh
+    mesh.label = Label.VEGETATION
     mesh.triangles(leaves.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), Material.LEAF)
 
 

@@ -1,0 +1,107 @@
+"""Lay out the streets of a town: crossings, curves, dead ends and districts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from lcd_common import se3
+
+_STEP_M = 2.0
+# How often a street is of a style: dense facades, gardens, trees without houses, halls, a square.
+STYLES = ('urban', 'residential', 'avenue', 'industrial', 'open')
+_STYLE_SHARES = (0.30, 0.36, 0.14, 0.12, 0.08)
+
+
+@dataclass(frozen=True)
+class StreetEdge:
+    """A street between two crossings.
+
+    Attributes:
+        i, j: nodes at its ends.
+        centreline: [M x 2] from node i to node j, about 2 m apart, metres.
+        style: what stands along it, one of STYLES or 'aliased'.
+        half_width_m: from the centreline to the kerb.
+    """
+
+    i: int
+    j: int
+    centreline: se3.Array
+    style: str
+    half_width_m: float
+
+    @property
+    def length_m(self) -> float:
+        """Length along the centreline."""
+        return float(np.linalg.norm(np.diff(self.centreline, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True)
+class StreetMap:
+    """Streets as a connected graph; nodes [N x 2] metres."""
+
+    nodes: se3.Array
+    edges: tuple[StreetEdge, ...]
+
+
+def street_map(seed: int, style: str | None = None, size: int = 6) -> StreetMap:
+    """Draw a map of about `size` x `size` crossings.
+
+    Args:
+        seed: of everything random.
+        style: one for all streets ('aliased': a district of equal houses); None mixes STYLES.
+        size: crossings each way.
+    """
+    rng = np.random.default_rng([seed, 11])
+    block = rng.uniform(62.0, 105.0, 2)
+    across = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing='ij'), -1)
+    jitter = 0.05 if style == 'aliased' else 0.24
+    nodes = (across + rng.uniform(-jitter, jitter, across.shape)) * block
+    # A town follows a valley or a shore: bend the whole grid.
+    bend = 0.0 if style == 'aliased' else rng.uniform(-1.0, 1.0)
+    nodes[..., 1] += bend * 25.0 * np.sin(nodes[..., 0] / nodes[..., 0].max() * np.pi)
+    turned = rng.uniform(0.0, 2.0 * np.pi)
+    c, s = np.cos(turned), np.sin(turned)
+    nodes = nodes.reshape(-1, 2) @ np.array([[c, s], [-s, c]])
+    nodes -= nodes.mean(axis=0)
+    index = np.arange(size * size).reshape(size, size)
+    pairs = [*zip(index[:-1].ravel(), index[1:].ravel(), strict=True)]
+    pairs += zip(index[:, :-1].ravel(), index[:, 1:].ravel(), strict=True)
+    pairs += [(index[a, b], index[a + 1, b + 1]) for a, b in rng.integers(0, size - 1, (2, 2))]
+    pairs = _thinned(pairs, len(nodes), rng)
+    edges = []
+    for i, j in pairs:
+        curved = 0.0 if style == 'aliased' or rng.random() < 0.45 else rng.uniform(-0.14, 0.14)
+        kind = style or str(rng.choice(STYLES, p=_STYLE_SHARES))
+        half = float(rng.choice([3.6, 4.5, 5.3, 6.5], p=[0.25, 0.3, 0.3, 0.15]))
+        edges.append(
+            StreetEdge(int(i), int(j), _centreline(nodes[i], nodes[j], curved), kind, half)
+        )
+    return StreetMap(nodes, tuple(edges))
+
+
+def _thinned(
+    pairs: list[tuple[int, int]], nodes: int, rng: np.random.Generator
+) -> list[tuple[int, int]]:
+    """Leave out a fifth of the streets where the map stays in one piece; dead ends come about."""
+    kept = list(dict.fromkeys(pairs))
+    for pair in rng.permutation(len(kept))[: len(kept) // 5]:
+        without = [p for p in kept if p is not None and p != pairs[pair]]
+        if _pieces(without, nodes) == 1:
+            kept = without
+    return kept
+
+
+def _pieces(pairs: list[tuple[int, int]], nodes: int) -> int:
+    i, j = np.array(pairs).T
+    return int(connected_components(coo_matrix((np.ones(len(i)), (i, j)), (nodes, nodes)))[0])
+
+
+def _centreline(a: se3.Array, b: se3.Array, curved: float) -> se3.Array:
+    """Return points from a to b on a bow that swings out by `curved` times the distance."""
+    along = b - a
+    length = float(np.linalg.norm(along))
+    t = np.linspace(0.0, 1.0, max(3, round(length / _STEP_M)))[:, None]
+    aside = np.array([-along[1], along[0]])
+    return np.asarray(a + t * along + curved * np.sin(np.pi * t) ** 2 * aside)
