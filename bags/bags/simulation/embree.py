@@ -7,6 +7,7 @@ from bags.simulation.hits import Hits
 from bags.simulation.scene import Scene
 from bags.street.mesh import Label
 
+_SIGHT_M = 150.0
 _MOVING = {Label.CAR: Label.MOVING_CAR, Label.PERSON: Label.MOVING_PERSON}
 
 
@@ -46,25 +47,48 @@ class EmbreeCaster:
         material = np.where(hit, mesh.materials[triangle], 0).astype(np.uint8)
         label = np.where(hit, mesh.labels[triangle], 0).astype(np.uint8)
         mover = np.full(len(rays), -1, np.int16)
-        for index, other in enumerate(self.scene.movers):
-            T = other.at(time_s)
-            if T is None:
-                continue
-            placed = other.mesh.vertices @ T[:3, :3].T.astype(np.float32) + T[:3, 3]
-            moved = self._tree(placed.astype(np.float32), other.mesh.triangles)
-            found = moved.cast_rays(rays_tensor)
+        moving = self._moving(np.asarray(origins, np.float64).reshape(-1, 3)[0], time_s)
+        if moving is not None:
+            vertices, triangles, owner, own = moving
+            found = self._tree(vertices, triangles).cast_rays(rays_tensor)
             nearer = found['t_hit'].numpy() < range_m
-            if not nearer.any():
-                continue
             range_m = np.where(nearer, found['t_hit'].numpy(), range_m)
             normal[nearer] = found['primitive_normals'].numpy()[nearer]
-            own = found['primitive_ids'].numpy().astype(np.int64)[nearer]
-            material[nearer] = other.mesh.materials[own]
-            label[nearer] = [_MOVING.get(Label(i), i) for i in other.mesh.labels[own]]
-            triangle[nearer], mover[nearer] = -1, index
+            which = found['primitive_ids'].numpy().astype(np.int64)[nearer]
+            mover[nearer], triangle[nearer] = owner[which], -1
+            for index in np.unique(owner[which]):
+                mesh, rows = self.scene.movers[index].mesh, own[which[owner[which] == index]]
+                at = np.flatnonzero(nearer)[owner[which] == index]
+                material[at] = mesh.materials[rows]
+                label[at] = [_MOVING.get(Label(i), i) for i in mesh.labels[rows]]
         incidence = np.abs(np.einsum('ij,ij->i', normal, rays[:, 3:]))
         return Hits(
             range_m, incidence.astype(np.float32), triangle.astype(np.int32), material, label, mover
+        )
+
+    def _moving(
+        self, origin: NDArray[np.float64], time_s: float
+    ) -> (
+        tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.int16], NDArray[np.int64]] | None
+    ):
+        """Return all movers near a point as one mesh, with each triangle's mover and own number."""
+        vertices, triangles, owner, own, count = [], [], [], [], 0
+        for index, mover in enumerate(self.scene.movers):
+            T = mover.at(time_s)
+            if T is None or np.linalg.norm(T[:3, 3] - origin) > _SIGHT_M:
+                continue
+            vertices.append((mover.mesh.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+            triangles.append(mover.mesh.triangles + np.uint32(count))
+            count += len(mover.mesh.vertices)
+            owner.append(np.full(len(triangles[-1]), index, np.int16))
+            own.append(np.arange(len(triangles[-1])))
+        if not vertices:
+            return None
+        return (
+            np.concatenate(vertices),
+            np.concatenate(triangles),
+            np.concatenate(owner),
+            np.concatenate(own),
         )
 
     def _tree(self, vertices: NDArray[np.float32], triangles: NDArray[np.uint32]):  # type: ignore[no-untyped-def]

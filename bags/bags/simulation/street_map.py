@@ -66,9 +66,15 @@ def street_map(seed: int, style: str | None = None, size: int = 6) -> StreetMap:
     nodes = nodes.reshape(-1, 2) @ np.array([[c, s], [-s, c]])
     nodes -= nodes.mean(axis=0)
     index = np.arange(size * size).reshape(size, size)
-    pairs = [*zip(index[:-1].ravel(), index[1:].ravel(), strict=True)]
-    pairs += zip(index[:, :-1].ravel(), index[:, 1:].ravel(), strict=True)
-    pairs += [(index[a, b], index[a + 1, b + 1]) for a, b in rng.integers(0, size - 1, (2, 2))]
+    first, second = (
+        [index[:-1].ravel(), index[:, :-1].ravel()],
+        [index[1:].ravel(), index[:, 1:].ravel()],
+    )
+    diagonal = rng.integers(0, size - 1, (2, 2))
+    first.append(index[tuple(diagonal.T)])
+    second.append(index[tuple(diagonal.T + 1)])
+    ends = np.concatenate(first).tolist(), np.concatenate(second).tolist()
+    pairs: list[tuple[int, int]] = list(zip(*ends, strict=True))
     pairs = _thinned(pairs, len(nodes), rng)
     edges = []
     for i, j in pairs:
