@@ -1,0 +1,189 @@
+"""Cast a spinning LiDAR's rays in pure torch: triangles are drawn into its range image.
+
+No tree over the triangles is needed: each one covers a window of columns and beams, and only the
+rays in the window are tested against it. Windows are exact, so the answer is Embree's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from bags.simulation.lidar_model import LidarModel
+from bags.street.mesh import Mesh
+
+_TWO_PI = 2.0 * np.pi
+_PAIRS = 2_000_000  # tested at a time on a CPU: what its caches and memory like
+_EDGE = 1e-7  # rays this near an edge count as inside, so that meshes have no cracks
+
+
+@dataclass(frozen=True)
+class RasterHits:
+    """What the rays of a sweep hit, [C x B] each.
+
+    Attributes:
+        range_m: infinity where nothing is hit.
+        incidence: cosine of the angle to the normal, 0..1; 0 where nothing is hit.
+        triangle: of the mesh, -1 where nothing is hit.
+    """
+
+    range_m: torch.Tensor
+    incidence: torch.Tensor
+    triangle: torch.Tensor
+
+
+class LidarRaster:
+    """Hold a mesh on a device and cast sweeps into it."""
+
+    def __init__(self, mesh: Mesh, model: LidarModel, device: torch.device | str = 'cpu') -> None:
+        """Move the mesh to the device; beams must come from top to bottom."""
+        self.model, self.device = model, torch.device(device)
+        vertices = torch.as_tensor(np.asarray(mesh.vertices, np.float32), device=device)
+        index = torch.as_tensor(mesh.triangles.astype(np.int64), device=device)
+        self._corners = vertices[index]  # [T x 3 x 3]
+        self._centre = self._corners.mean(1)
+        self._reach = (self._corners - self._centre[:, None]).norm(dim=2).amax(1)
+        self.materials = torch.as_tensor(mesh.materials.astype(np.int64), device=device)
+        self.labels = torch.as_tensor(mesh.labels.astype(np.int64), device=device)
+        directions = np.ascontiguousarray(model.directions().reshape(-1, 3), np.float32)
+        self._directions = torch.as_tensor(directions, device=device)
+        tangent = np.tan(model.elevation_rad)
+        if not np.all(np.diff(tangent) < 0):
+            raise ValueError('the beams of a LidarModel must come from top to bottom')
+        self._falling = torch.as_tensor(-tangent, dtype=torch.float32, device=device)
+
+    def cast(self, T_world_lidar: np.ndarray) -> RasterHits:
+        """Return what a sweep taken at one pose [4 x 4] hits."""
+        T = torch.as_tensor(np.asarray(T_world_lidar, np.float32), device=self.device)
+        away = (self._centre - T[:3, 3]).norm(dim=1) - self._reach
+        near = torch.nonzero(away < self.model.max_range_m).squeeze(1)
+        corners = (self._corners[near] - T[:3, 3]) @ T[:3, :3]  # R^T (p - t), row by row
+        columns, beams = self.model.columns, len(self.model.elevation_rad)
+        first_column, n_columns = self._column_window(corners)
+        first_beam, n_beams = self._beam_window(corners)
+        count = n_columns * n_beams
+        seen = torch.nonzero(count > 0).squeeze(1)
+        near, corners, count = near[seen], corners[seen], count[seen]
+        window = torch.stack([first_column[seen], first_beam[seen], n_beams[seen]], 1)
+        planes = _planes(corners)
+        range_m = torch.full((columns * beams,), torch.inf, device=self.device)
+        triangle = torch.full((columns * beams,), -1, dtype=torch.int64, device=self.device)
+        for begin, end in self._pieces(count):
+            self._draw(planes, window, count, begin, end, range_m, triangle)
+        hit = triangle >= 0
+        normal = planes[triangle.clamp(min=0), 3]
+        cosine = (normal * self._directions).sum(1).abs() / normal.norm(dim=1).clamp(min=1e-12)
+        far = range_m > self.model.max_range_m
+        range_m[far], triangle[far] = torch.inf, -1
+        return RasterHits(
+            range_m.view(columns, beams),
+            torch.where(hit & ~far, cosine, torch.zeros_like(cosine)).view(columns, beams),
+            torch.where(triangle >= 0, near[triangle.clamp(min=0)], triangle).view(columns, beams),
+        )
+
+    def _draw(
+        self,
+        planes: torch.Tensor,
+        window: torch.Tensor,
+        count: torch.Tensor,
+        begin: int,
+        end: int,
+        range_m: torch.Tensor,
+        triangle: torch.Tensor,
+    ) -> None:
+        """Test triangles begin..end against the rays of their windows; keep what is nearest."""
+        columns, beams = self.model.columns, len(self.model.elevation_rad)
+        number = count[begin:end]
+        which = torch.repeat_interleave(
+            torch.arange(begin, end, device=self.device), number, output_size=int(number.sum())
+        )
+        start = torch.cumsum(number, 0) - number
+        place = torch.arange(len(which), device=self.device) - start[which - begin]
+        first_column, first_beam, n_beams = window[which].unbind(1)
+        column = torch.div(place, n_beams, rounding_mode='floor')
+        ray = (first_column + column) % columns * beams + first_beam + place - column * n_beams
+        own, d = planes[which], self._directions[ray]
+        sides = torch.bmm(own[:, :4], d[:, :, None]).squeeze(2)  # three edges, then the normal
+        edges = sides[:, :3]
+        inside = (edges >= -_EDGE).all(1) | (edges <= _EDGE).all(1)
+        distance = own[:, 4, 0] / sides[:, 3]
+        ok = torch.nonzero(inside & (distance > 0.0) & torch.isfinite(distance)).squeeze(1)
+        ray, distance, which = ray[ok], distance[ok], which[ok]
+        nearest = torch.full_like(range_m, torch.inf)
+        nearest.scatter_reduce_(0, ray, distance, 'amin')
+        better = torch.nonzero((distance == nearest[ray]) & (distance < range_m[ray])).squeeze(1)
+        triangle[ray[better]] = which[better]
+        range_m[ray[better]] = distance[better]
+
+    def _pieces(self, count: torch.Tensor) -> list[tuple[int, int]]:
+        if self.device.type != 'cpu':
+            return [(0, len(count))]
+        total = torch.cumsum(count, 0)
+        if not len(total):
+            return []
+        marks = torch.arange(_PAIRS, int(total[-1]) + _PAIRS, _PAIRS)
+        ends = torch.searchsorted(total, marks).clamp(max=len(count) - 1) + 1
+        edges = torch.unique(torch.cat([torch.zeros(1, dtype=torch.int64), ends])).tolist()
+        return list(zip(edges[:-1], edges[1:], strict=True))
+
+    def _column_window(self, corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the first column and the number of columns that each triangle may cover."""
+        columns = self.model.columns
+        azimuth = torch.atan2(corners[..., 1], corners[..., 0])
+        turn = azimuth[:, 1:] - azimuth[:, :1]
+        turn = turn - _TWO_PI * torch.round(turn / _TWO_PI)
+        low = azimuth[:, 0] + turn.amin(1).clamp(max=0.0)
+        high = azimuth[:, 0] + turn.amax(1).clamp(min=0.0)
+        slack = 1e-4
+        first = torch.ceil((np.pi - high) / _TWO_PI * columns - 0.5 - slack)
+        last = torch.floor((np.pi - low) / _TWO_PI * columns - 0.5 + slack)
+        # A triangle above or below the sensor, or one that nearly is, is seen all around.
+        around = _on_axis(corners) | (high - low > 0.9 * np.pi)
+        first = torch.where(around, torch.zeros_like(first), first)
+        number = torch.where(around, torch.full_like(first, columns), last - first + 1)
+        return first.long(), number.long().clamp(0, columns)
+
+    def _beam_window(self, corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the first beam and the number of beams that each triangle may cover."""
+        level = corners[..., :2].norm(dim=2).clamp(min=1e-9)
+        tangent = corners[..., 2] / level
+        low, high = tangent.amin(1), tangent.amax(1)
+        # An edge is steepest or flattest within at most one place: d(z/r) = 0 along it.
+        step = corners.roll(-1, 1) - corners
+        a = (step[..., :2] ** 2).sum(2)
+        b = (corners[..., :2] * step[..., :2]).sum(2)
+        c = (corners[..., :2] ** 2).sum(2)
+        z, dz = corners[..., 2], step[..., 2]
+        t = ((z * b - dz * c) / (dz * b - z * a)).nan_to_num(0.0, 0.0, 0.0).clamp(0.0, 1.0)
+        at = corners + t[..., None] * step
+        between = at[..., 2] / at[..., :2].norm(dim=2).clamp(min=1e-9)
+        low, high = torch.minimum(low, between.amin(1)), torch.maximum(high, between.amax(1))
+        around = _on_axis(corners)
+        above = corners[..., 2].mean(1) > 0
+        high = torch.where(around & above, torch.full_like(high, torch.inf), high)
+        low = torch.where(around & ~above, torch.full_like(low, -torch.inf), low)
+        slack = 1e-5 * (1.0 + torch.maximum(low.abs(), high.abs()).nan_to_num(posinf=1.0))
+        first = torch.searchsorted(self._falling, -(high + slack))
+        last = torch.searchsorted(self._falling, -(low - slack), right=True)
+        return first, (last - first).clamp(min=0)
+
+
+def _on_axis(corners: torch.Tensor) -> torch.Tensor:
+    """Tell whether the sensor's vertical axis passes through a triangle."""
+    x, y = corners[..., 0], corners[..., 1]
+    cross = x * y.roll(-1, 1) - x.roll(-1, 1) * y
+    return (cross > 0.0).all(1) | (cross < 0.0).all(1)
+
+
+def _planes(corners: torch.Tensor) -> torch.Tensor:
+    """Return per triangle the normals of its three edges' planes through the sensor, its own.
+
+    The fifth row holds the distance of its plane times the length of its normal: [T x 5 x 3].
+    """
+    # In double precision: the products of metres lose what decides at shared edges.
+    p = corners.double()
+    edges = torch.cross(p, p.roll(-1, 1), dim=2)
+    edges = edges / edges.norm(dim=2, keepdim=True).clamp(min=1e-12)
+    normal = torch.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], dim=1)
+    offset = (normal * p[:, 0]).sum(1)[:, None, None].expand(-1, 1, 3)
+    return torch.cat([edges, normal[:, None], offset], 1).float()
