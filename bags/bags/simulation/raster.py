@@ -5,12 +5,15 @@ rays in the window are tested against it. Windows are exact, so the answer is Em
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
 
 from bags.simulation.lidar_model import LidarModel
-from bags.street.mesh import Mesh
+from bags.simulation.scene import Scene
+from bags.street.mesh import MOVING, Label
+from lcd_common.errors import ConfigError
 
 _TWO_PI = 2.0 * np.pi
 _PAIRS = 2_000_000  # tested at a time on a CPU: what its caches and memory like
@@ -24,62 +27,118 @@ class RasterHits:
     Attributes:
         range_m: infinity where nothing is hit.
         incidence: cosine of the angle to the normal, 0..1; 0 where nothing is hit.
-        triangle: of the mesh, -1 where nothing is hit.
+        triangle: of the standing mesh; -1 where nothing or a mover is hit.
+        material, label: bags.street.mesh.Material and Label; 0 where nothing is hit.
+        moving: whether it is a mover.
     """
 
     range_m: torch.Tensor
     incidence: torch.Tensor
     triangle: torch.Tensor
+    material: torch.Tensor
+    label: torch.Tensor
+    moving: torch.Tensor
 
 
 class LidarRaster:
-    """Hold a mesh on a device and cast sweeps into it."""
+    """Hold a scene on a device and cast sweeps into it."""
 
-    def __init__(self, mesh: Mesh, model: LidarModel, device: torch.device | str = 'cpu') -> None:
-        """Move the mesh to the device; beams must come from top to bottom."""
-        self.model, self.device = model, torch.device(device)
-        vertices = torch.as_tensor(np.asarray(mesh.vertices, np.float32), device=device)
-        index = torch.as_tensor(mesh.triangles.astype(np.int64), device=device)
-        self._corners = vertices[index]  # [T x 3 x 3]
+    def __init__(self, scene: Scene, model: LidarModel, device: torch.device | str = 'cpu') -> None:
+        """Move the scene to the device; beams must come from top to bottom."""
+        self.scene, self.device = scene, torch.device(device)
+        mesh = scene.mesh
+        self._corners = self._on_device(mesh.vertices[mesh.triangles])  # [T x 3 x 3]
         self._centre = self._corners.mean(1)
         self._reach = (self._corners - self._centre[:, None]).norm(dim=2).amax(1)
-        self.materials = torch.as_tensor(mesh.materials.astype(np.int64), device=device)
-        self.labels = torch.as_tensor(mesh.labels.astype(np.int64), device=device)
+        self._materials = self._on_device(mesh.materials.astype(np.int64))
+        self._labels = self._on_device(mesh.labels.astype(np.int64))
+        self.look_with(model)
+
+    def look_with(self, model: LidarModel) -> None:
+        """Use another LiDAR from now on.
+
+        Raises:
+            ConfigError: its beams do not come from top to bottom.
+        """
+        self.model = model
         directions = np.ascontiguousarray(model.directions().reshape(-1, 3), np.float32)
-        self._directions = torch.as_tensor(directions, device=device)
+        self._directions = self._on_device(directions)
         tangent = np.tan(model.elevation_rad)
         if not np.all(np.diff(tangent) < 0):
-            raise ValueError('the beams of a LidarModel must come from top to bottom')
-        self._falling = torch.as_tensor(-tangent, dtype=torch.float32, device=device)
+            raise ConfigError(f'the beams of {model.name} must come from top to bottom')
+        self._falling = self._on_device(-tangent.astype(np.float32))
 
-    def cast(self, T_world_lidar: np.ndarray) -> RasterHits:
-        """Return what a sweep taken at one pose [4 x 4] hits."""
-        T = torch.as_tensor(np.asarray(T_world_lidar, np.float32), device=self.device)
+    @property
+    def directions(self) -> torch.Tensor:
+        """Unit vectors [C x B x 3] of the rays, lidar frame."""
+        return self._directions.view(self.model.columns, -1, 3)
+
+    def cast(self, T_world_lidar: np.ndarray, time_s: float = 0.0) -> RasterHits:
+        """Return what a sweep taken at one pose [4 x 4] and time hits."""
+        T = self._on_device(np.asarray(T_world_lidar, np.float32))
         away = (self._centre - T[:3, 3]).norm(dim=1) - self._reach
         near = torch.nonzero(away < self.model.max_range_m).squeeze(1)
-        corners = (self._corners[near] - T[:3, 3]) @ T[:3, :3]  # R^T (p - t), row by row
+        corners, materials, labels = self._corners[near], self._materials[near], self._labels[near]
+        moving = self._movers(np.asarray(T_world_lidar)[:3, 3], time_s)
+        if moving is not None:
+            corners = torch.cat([corners, moving[0]])
+            materials, labels = torch.cat([materials, moving[1]]), torch.cat([labels, moving[2]])
+            near = torch.cat([near, torch.full_like(moving[1], -1)])
+        corners = (corners - T[:3, 3]) @ T[:3, :3]  # R^T (p - t), row by row
         columns, beams = self.model.columns, len(self.model.elevation_rad)
         first_column, n_columns = self._column_window(corners)
         first_beam, n_beams = self._beam_window(corners)
         count = n_columns * n_beams
         seen = torch.nonzero(count > 0).squeeze(1)
-        near, corners, count = near[seen], corners[seen], count[seen]
+        corners, count = corners[seen], count[seen]
         window = torch.stack([first_column[seen], first_beam[seen], n_beams[seen]], 1)
         planes = _planes(corners)
         range_m = torch.full((columns * beams,), torch.inf, device=self.device)
         triangle = torch.full((columns * beams,), -1, dtype=torch.int64, device=self.device)
         for begin, end in self._pieces(count):
             self._draw(planes, window, count, begin, end, range_m, triangle)
-        hit = triangle >= 0
-        normal = planes[triangle.clamp(min=0), 3]
-        cosine = (normal * self._directions).sum(1).abs() / normal.norm(dim=1).clamp(min=1e-12)
         far = range_m > self.model.max_range_m
         range_m[far], triangle[far] = torch.inf, -1
-        return RasterHits(
-            range_m.view(columns, beams),
-            torch.where(hit & ~far, cosine, torch.zeros_like(cosine)).view(columns, beams),
-            torch.where(triangle >= 0, near[triangle.clamp(min=0)], triangle).view(columns, beams),
+        hit, at = triangle >= 0, triangle.clamp(min=0)
+        if not len(seen):
+            nothing = torch.zeros_like(triangle)
+            parts = [range_m, torch.zeros_like(range_m), triangle, nothing, nothing, nothing > 0]
+            return RasterHits(*(part.view(columns, beams) for part in parts))
+        normal, number = planes[at, 3], seen[at]
+        cosine = (normal * self._directions).sum(1).abs() / normal.norm(dim=1).clamp(min=1e-12)
+        parts = [
+            range_m,
+            torch.where(hit, cosine, 0.0 * cosine),
+            torch.where(hit, near[number], triangle),
+            torch.where(hit, materials[number], 0 * number),
+            torch.where(hit, labels[number], 0 * number),
+            hit & (near[number] < 0),
+        ]
+        return RasterHits(*(part.view(columns, beams) for part in parts))
+
+    def _movers(
+        self, origin: np.ndarray, time_s: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None:
+        """Return corners, materials and labels of the movers in reach."""
+        corners, materials, labels = [], [], []
+        for mover in self.scene.movers:
+            T = mover.at(time_s)
+            if T is None or np.linalg.norm(T[:3, 3] - origin) > self.model.max_range_m + 10.0:
+                continue
+            placed = (mover.mesh.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+            corners.append(placed[mover.mesh.triangles])
+            materials.append(mover.mesh.materials.astype(np.int64))
+            labels.append([MOVING.get(Label(i), i) for i in mover.mesh.labels])
+        if not corners:
+            return None
+        return (
+            self._on_device(np.concatenate(corners)),
+            self._on_device(np.concatenate(materials)),
+            self._on_device(np.concatenate(labels).astype(np.int64)),
         )
+
+    def _on_device(self, array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array), device=self.device)
 
     def _draw(
         self,
@@ -124,7 +183,7 @@ class LidarRaster:
         marks = torch.arange(_PAIRS, int(total[-1]) + _PAIRS, _PAIRS)
         ends = torch.searchsorted(total, marks).clamp(max=len(count) - 1) + 1
         edges = torch.unique(torch.cat([torch.zeros(1, dtype=torch.int64), ends])).tolist()
-        return list(zip(edges[:-1], edges[1:], strict=True))
+        return list(pairwise(edges))
 
     def _column_window(self, corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the first column and the number of columns that each triangle may cover."""
