@@ -1,0 +1,229 @@
+"""Stream simulated sweeps into training, on any device, without files.
+
+Towns are built by numpy and cast by torch: neither Open3D nor ROS is needed.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from bags.simulation.lidar_measurement import Draws, Surfaces, beam_errors, measure, neighbours
+from bags.simulation.lidar_model import lidar_model
+from bags.simulation.raster import LidarRaster
+from bags.simulation.street_map import StreetEdge
+from bags.simulation.town import SimulatedTown
+from bags.street.mesh import REFLECTIVITY, RETURN_SHARE
+from lcd_common import se3
+from lcd_common.errors import ConfigError
+
+TRAIN_SEEDS, VALIDATION_SEEDS, TEST_SEEDS = range(100), range(100, 110), range(200, 210)
+_PATCH_M = 2.0
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """What is streamed.
+
+    Attributes:
+        sensors: names of bags.simulation.lidar_model.LIDARS, drawn at random for each place.
+        sweeps_per_town: after which the oldest town held gives way to a new one.
+        towns_held: at a time, on the device.
+        runs: of a town, to draw from; sweeps of one place come from two of them at random.
+        height_m: (least, most) of the sensor above the road.
+        tilt_rad: standard deviation of roll and pitch.
+        lane_m: (least, most) distance right of the centreline.
+        blocked_deg: widths of random sectors that may be blocked; 0 leaves the sweep whole.
+    """
+
+    sensors: tuple[str, ...] = ('hdl64',)
+    sweeps_per_town: int = 400
+    towns_held: int = 3
+    runs: int = 3
+    height_m: tuple[float, float] = (1.6, 1.9)
+    tilt_rad: float = 0.01
+    lane_m: tuple[float, float] = (0.5, 3.0)
+    blocked_deg: tuple[float, ...] = (0.0,)
+
+
+@dataclass(frozen=True)
+class StreamedSweep:
+    """One sweep.
+
+    Attributes:
+        xyz: [N x 3] float32 on the stream's device, lidar frame, metres.
+        intensity: [N] 0..1.
+        T_world_lidar: [4 x 4] float64.
+        town, run, sensor: where from.
+    """
+
+    xyz: torch.Tensor
+    intensity: torch.Tensor
+    T_world_lidar: se3.Array
+    town: int
+    run: int
+    sensor: str
+
+
+@dataclass
+class _HeldTown:
+    town: SimulatedTown
+    rasters: dict[int, LidarRaster] = field(default_factory=dict)
+    sweeps: int = 0
+
+
+class SweepStream:
+    """Draw places of many towns and sweep them; the same seed gives the same stream."""
+
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        settings: StreamConfig | None = None,
+        *,
+        device: torch.device | str = 'cpu',
+        seed: int = 0,
+        styles: Sequence[str | None] = (None,),
+    ) -> None:
+        """Start a stream.
+
+        Args:
+            seeds: of the towns, TRAIN_SEEDS for training.
+            settings: what is streamed.
+            device: where sweeps are cast and returned.
+            seed: of everything that is drawn.
+            styles: of the towns, drawn at random.
+
+        Raises:
+            ConfigError: there is no sensor of a name, or no town.
+        """
+        self.settings = settings or StreamConfig()
+        if not seeds:
+            raise ConfigError('a stream needs the seed of at least one town')
+        self.models = {name: lidar_model(name) for name in self.settings.sensors}
+        self.device = torch.device(device)
+        self._seeds, self._styles = list(seeds), list(styles)
+        self._rng = np.random.default_rng([seed, 71])
+        self._held: list[_HeldTown] = []
+
+    def pairs(
+        self, max_distance_m: float = 4.0, any_heading: bool = True
+    ) -> Iterator[tuple[StreamedSweep, StreamedSweep]]:
+        """Yield sweeps of one place, of two runs, at most so far apart, without end."""
+        while True:
+            held, edge = self._place()
+            s = float(self._rng.uniform(0.0, edge.length_m))
+            sensor = str(self._rng.choice(self.settings.sensors))
+            T_first = T_second = self._pose(held.town, edge, s)
+            while T_second is T_first or _apart_m(T_first, T_second) > max_distance_m:
+                near = s + float(self._rng.uniform(-max_distance_m, max_distance_m))
+                T_second = self._pose(held.town, edge, near, any_heading=any_heading)
+            yield self._sweep(held, T_first, sensor), self._sweep(held, T_second, sensor)
+
+    def sweeps(self) -> Iterator[StreamedSweep]:
+        """Yield sweeps of random places without end."""
+        while True:
+            held, edge = self._place()
+            s = float(self._rng.uniform(0.0, edge.length_m))
+            sensor = str(self._rng.choice(self.settings.sensors))
+            yield self._sweep(held, self._pose(held.town, edge, s), sensor)
+
+    def _place(self) -> tuple[_HeldTown, StreetEdge]:
+        """Draw a town that is held, and a street of it."""
+        settings, rng = self.settings, self._rng
+        if self._held and self._held[0].sweeps >= settings.sweeps_per_town:
+            self._held.pop(0)
+        while len(self._held) < min(settings.towns_held, len(self._seeds)):
+            style = self._styles[int(rng.integers(len(self._styles)))]
+            self._held.append(_HeldTown(SimulatedTown(int(rng.choice(self._seeds)), style)))
+        held = self._held[int(rng.integers(len(self._held)))]
+        lengths = np.array([edge.length_m for edge in held.town.streets.edges])
+        chosen = int(rng.choice(len(lengths), p=lengths / lengths.sum()))
+        return held, held.town.streets.edges[chosen]
+
+    def _sweep(self, held: _HeldTown, T: se3.Array, sensor: str) -> StreamedSweep:
+        rng, run = self._rng, int(self._rng.integers(self.settings.runs))
+        if run not in held.rasters:
+            held.rasters[run] = LidarRaster(held.town.scene(run), self.models[sensor], self.device)
+        held.sweeps += 1
+        model = self.models[sensor]
+        width = float(rng.choice(self.settings.blocked_deg))
+        if width:
+            begin = float(rng.uniform(0.0, 360.0))
+            model = model.blocked(*model.blocked_deg, (begin, begin + width))
+        raster = held.rasters[run]
+        raster.look_with(model)
+        xyz, intensity = measured_sweep(raster, T, float(rng.uniform(0.0, 600.0)), rng)
+        return StreamedSweep(xyz, intensity, T, held.town.seed, run, sensor)
+
+    def _pose(
+        self, town: SimulatedTown, edge: StreetEdge, s: float, any_heading: bool = True
+    ) -> se3.Array:
+        """Draw T_world_lidar in one of the lanes, `s` metres along a street."""
+        rng, settings = self._rng, self.settings
+        reverse = any_heading and rng.random() < 0.5
+        lane = min(float(rng.uniform(*settings.lane_m)), 0.5 * edge.half_width_m)
+        s = float(np.clip(s, 0.0, edge.length_m))
+        line = edge.centreline
+        at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        k = int(np.clip(np.searchsorted(at, s) - 1, 0, len(line) - 2))
+        direction = (line[k + 1] - line[k]) / (at[k + 1] - at[k])
+        xy = line[k] + (s - at[k]) * direction
+        heading = np.arctan2(direction[1], direction[0]) + (np.pi if reverse else 0.0)
+        xy = xy + lane * np.array([np.sin(heading), -np.cos(heading)])
+        height = float(town.ground.height(xy[None])[0]) + float(rng.uniform(*settings.height_m))
+        roll, pitch = rng.normal(0.0, settings.tilt_rad, 2)
+        T = se3.rotation_z(float(heading + rng.normal(0.0, 0.03)))
+        T = T @ se3.exp(np.array([0.0, 0.0, 0.0, roll, pitch, 0.0]))
+        T[:3, 3] = *xy, height
+        return np.asarray(T)
+
+
+def _apart_m(T_a: se3.Array, T_b: se3.Array) -> float:
+    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
+
+
+def measured_sweep(
+    raster: LidarRaster, T_world_lidar: se3.Array, time_s: float, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cast and measure one sweep; return points [N x 3], lidar frame, and intensity [N]."""
+    model, device = raster.model, raster.device
+    hits = raster.cast(T_world_lidar, time_s)
+    shape = hits.range_m.shape
+    generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+    normal = torch.randn((2, *shape), generator=generator, device=device)
+    uniform = torch.rand((2, *shape), generator=generator, device=device)
+    to_device = {'dtype': torch.float32, 'device': device}
+    reflectivity = torch.as_tensor(REFLECTIVITY, **to_device)[hits.material]  # type: ignore[call-overload]
+    R, t = (
+        torch.as_tensor(part, **to_device) for part in (T_world_lidar[:3, :3], T_world_lidar[:3, 3])
+    )  # type: ignore[call-overload]
+    finite = torch.where(torch.isfinite(hits.range_m), hits.range_m, 0.0 * normal[0])
+    xyz_world = (finite[..., None] * raster.directions) @ R.T + t
+    surfaces = Surfaces(
+        hits.range_m,
+        hits.incidence,
+        (reflectivity * patchiness(xyz_world)).clamp(0.02, 1.0),
+        torch.as_tensor(RETURN_SHARE, **to_device)[hits.material],  # type: ignore[call-overload]
+    )
+    near = neighbours(model, rng.random(shape, np.float32))
+    near = type(near)(
+        torch.as_tensor(near.index, device=device),
+        torch.as_tensor(near.spacing_rad, device=device),
+    )
+    beam_error_m = torch.as_tensor(beam_errors(model, int(rng.integers(8))), **to_device)  # type: ignore[call-overload]
+    draws = Draws(normal[0], normal[1], uniform[0], uniform[1])
+    echoes = measure(surfaces, near, draws, model, beam_error_m, torch)
+    returned = torch.isfinite(echoes.range_m)
+    returned &= torch.as_tensor(model.open_columns(), device=device)[:, None]
+    xyz = raster.directions[returned] * echoes.range_m[returned][:, None]
+    return xyz, echoes.intensity[returned]
+
+
+def patchiness(xyz: torch.Tensor) -> torch.Tensor:
+    """Return bags.simulation.lidar.patchiness of world points [... x 3]."""
+    cell = torch.floor(xyz / _PATCH_M).to(torch.int32)
+    mixed = cell[..., 0] * 73856093
+    mixed = mixed ^ (cell[..., 1] * 19349663) ^ (cell[..., 2] * 83492791)
+    mixed = mixed ^ (mixed >> 13)
+    return 0.7 + 0.6 * ((mixed & 0xFFFF).to(torch.float32) / 65535.0)

@@ -1,0 +1,79 @@
+"""Sweeps for training: repeatable, of one place, with true poses."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from bags.simulation.lidar import patchiness as patchiness_numpy
+from bags.simulation.stream import (
+    TEST_SEEDS,
+    TRAIN_SEEDS,
+    VALIDATION_SEEDS,
+    StreamConfig,
+    SweepStream,
+    patchiness,
+)
+from lcd_common.errors import ConfigError
+
+SMALL = StreamConfig(sensors=('vlp16', 'os1_64'), sweeps_per_town=8, towns_held=1, runs=2)
+
+
+def world(sweep) -> np.ndarray:
+    T = sweep.T_world_lidar
+    return sweep.xyz.numpy() @ T[:3, :3].T + T[:3, 3]
+
+
+def test_splits_do_not_share_towns() -> None:
+    splits = [set(seeds) for seeds in (TRAIN_SEEDS, VALIDATION_SEEDS, TEST_SEEDS)]
+    assert [len(split) for split in splits] == [100, 10, 10]
+    assert len(set.union(*splits)) == 120
+
+
+def test_pairs_show_one_place_within_the_distance() -> None:
+    stream = SweepStream(TRAIN_SEEDS[:2], SMALL)
+    headings = []
+    for a, b in islice(stream.pairs(max_distance_m=4.0), 6):
+        assert (a.town, a.sensor) == (b.town, b.sensor)
+        assert np.linalg.norm(a.T_world_lidar[:3, 3] - b.T_world_lidar[:3, 3]) <= 4.0
+        headings.append(float(a.T_world_lidar[:3, 0] @ b.T_world_lidar[:3, 0]))
+        near = np.linalg.norm(a.xyz.numpy(), axis=1) < 15.0
+        away = cKDTree(world(b)).query(world(a)[near])[0]
+        assert np.median(away) < 0.3  # no more than the spacing of the rings
+        assert a.xyz.dtype == torch.float32 and len(a.intensity) == len(a.xyz)
+        assert float(a.intensity.min()) >= 0.0 and float(a.intensity.max()) <= 1.0
+    assert min(headings) < -0.9 and max(headings) > 0.9
+
+
+def test_the_same_seed_streams_the_same_sweeps() -> None:
+    def first(seed: int):
+        return next(SweepStream([3], SMALL, seed=seed).sweeps())
+
+    a, b, other = first(5), first(5), first(6)
+    assert torch.equal(a.xyz, b.xyz) and torch.equal(a.intensity, b.intensity)
+    assert a.xyz.shape != other.xyz.shape or not torch.equal(a.xyz, other.xyz)
+
+
+def test_blocked_sectors_hold_no_points() -> None:
+    settings = StreamConfig(sensors=('vlp16',), towns_held=1, runs=1, blocked_deg=(90.0,))
+    for sweep in islice(SweepStream([4], settings).sweeps(), 3):
+        azimuth = np.degrees(np.arctan2(sweep.xyz[:, 1].numpy(), sweep.xyz[:, 0].numpy()))
+        edges = np.sort(azimuth % 360.0)
+        gap = np.diff(np.r_[edges, edges[0] + 360.0]).max()
+        assert 89.0 < gap < 140.0
+
+
+def test_patches_are_those_of_the_numpy_sensor() -> None:
+    xyz = np.random.default_rng(0).uniform(-300.0, 300.0, (5000, 3)).astype(np.float32)
+    np.testing.assert_allclose(patchiness(torch.as_tensor(xyz)).numpy(), patchiness_numpy(xyz))
+
+
+def test_mistakes_are_told() -> None:
+    with pytest.raises(ConfigError, match='at least one town'):
+        SweepStream([])
+    with pytest.raises(ConfigError, match='a lidar is one of'):
+        SweepStream([1], StreamConfig(sensors=('sick',)))
