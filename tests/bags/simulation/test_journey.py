@@ -29,7 +29,7 @@ def metre_by_metre(journey: Journey) -> se3.Array:
 
 
 def revisits(T: se3.Array) -> dict[str, float]:
-    """Count, with the thesis's rule, how much of a drive revisits; by the heading of the nearest."""
+    """Count how much of a drive revisits by the thesis's rule, and which way."""
     settings = RevisitConfig(excluded_scans=30, first_scan=30)
     found = true_loops(T[:, :3, 3], settings)
     yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
