@@ -9,18 +9,12 @@
 Exits with 1 when a section failed or a required figure is missing.
 """
 
-import argparse
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from benchmarks import report
-from lcd_common.command_line import run
-from lcd_common.errors import LocalizationError
+from benchmarks.command import Benchmark, Section, run_benchmark
 
 REQUIRED = (
     'out_and_back.odometry_lost',
@@ -45,8 +39,6 @@ REQUIRED = (
     'memory.bytes_per_keyframe',
     'peers.kiss_slam.*',
 )
-
-Section = Callable[[Path], dict[str, Any]]
 
 
 def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
@@ -82,62 +74,8 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(
-        prog='python -m benchmarks.drive',
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument('--only', nargs='+', metavar='SECTION', help='measure only these')
-    parser.add_argument('--list', action='store_true', help='list the sections and stop')
-    parser.add_argument(
-        '--quick', action='store_true', help='shorter, and marked so in the results'
-    )
-    parser.add_argument('--work', type=Path, help='folder for intermediate files, kept')
-    arguments = parser.parse_args(argv)
-    return run(lambda: _run(arguments))
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    known = sections(arguments.quick)
-    if arguments.list:
-        for name, (text, _) in known.items():
-            print(f'{name:<14}{text}')
-        return 0
-    unknown = sorted(set(arguments.only or ()) - set(known))
-    if unknown:
-        raise LocalizationError(f'no section {", ".join(unknown)}; there are {", ".join(known)}')
-    chosen = [name for name in known if not arguments.only or name in arguments.only]
-    with tempfile.TemporaryDirectory(prefix='drive_benchmark_') as temporary:
-        work = arguments.work or Path(temporary)
-        work.mkdir(parents=True, exist_ok=True)
-        failures = measure({name: known[name][1] for name in chosen}, work, arguments.quick)
-    figures = report.read('drive')
-    report.print_table(figures)
-    absent = report.missing(figures, REQUIRED)
-    for name, error in failures.items():
-        print(f'could not run {name}: {error}', file=sys.stderr)
-    if absent:
-        print(f'missing figures: {", ".join(absent)}', file=sys.stderr)
-    return 1 if failures or absent else 0
-
-
-def measure(chosen: dict[str, Section], work: Path, quick: bool = False) -> dict[str, str]:
-    """Run sections one by one, keeping each one's figures at once; return what failed, and why."""
-    failures = {}
-    for number, (name, section) in enumerate(chosen.items(), start=1):
-        print(f'[{number}/{len(chosen)}] {name} ...', file=sys.stderr, flush=True)
-        start = time.perf_counter()
-        try:
-            new = section(work)
-        except (LocalizationError, OSError, AssertionError, RuntimeError, ImportError) as error:
-            failures[name] = f'{type(error).__name__}: {error}'
-            continue
-        seconds = time.perf_counter() - start
-        figures = _placed(report.read('drive'), name, new)
-        measured = {**report.provenance(), 'seconds': round(seconds, 1), 'quick': quick}
-        figures['measured'] = {**figures.get('measured', {}), name: measured}
-        report.write('drive', figures)
-    return failures
+    benchmark = Benchmark('drive', __doc__ or '', sections, REQUIRED, _placed)
+    return run_benchmark(benchmark, argv)
 
 
 def _placed(figures: dict[str, Any], section: str, new: dict[str, Any]) -> dict[str, Any]:

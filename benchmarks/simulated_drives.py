@@ -1,0 +1,125 @@
+"""Drives through simulated towns: how hard, how much drift, and live."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bags.simulation.drive import SimulatedDrive
+from bags.simulation.itinerary import JourneyConfig
+from bags.simulation.stream import TEST_SEEDS
+from bags.simulation.town import SimulatedTown
+from lcd_common import se3
+from lcd_loop_closure.report.detection_protocols import PrecisionRecall, candidates, protocol_1
+from lcd_loop_closure.revisits import count_revisits
+from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
+
+_HEIGHT_M = 1.73
+_SPACING_M = 1.0  # KITTI's cars take a scan a metre
+# One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
+_JOURNEYS = {
+    'same_way': JourneyConfig(length=2500.0, same_way=0.3, reverse=0.0, lateral=1.5),
+    'reverse': JourneyConfig(length=2500.0, same_way=0.0, reverse=0.3, lateral=1.5),
+}
+
+
+def scan_context(work: Path, towns: int = 3) -> dict[str, Any]:
+    """Return Scan Context's average precision by protocol 1 on drives through test towns."""
+    del work
+    figures: dict[str, Any] = {}
+    for name, journey in _JOURNEYS.items():
+        curves = {}
+        for seed in TEST_SEEDS[:towns]:
+            curve, loops = judge(SimulatedDrive(SimulatedTown(seed), journey=journey))
+            curves[f'town_{seed}'] = {'average_precision': curve.average_precision, 'loops': loops}
+        figures[name] = float(np.mean([c['average_precision'] for c in curves.values()]))
+        figures[f'{name}_by_town'] = curves
+    aliased = SimulatedDrive(
+        SimulatedTown(TEST_SEEDS[-1], 'aliased'), journey=_JOURNEYS['same_way']
+    )
+    figures['aliased_same_way'] = judge(aliased)[0].average_precision
+    return {'scan_context_ap': figures}
+
+
+def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, int]:
+    """Describe a drive by Scan Context; return its curve and how many scans are loops."""
+    descriptor = ScanContext(ScanContextConfig())
+    kept, poses = spaced(drive)
+    rows = []
+    for index in kept:
+        xyz = drive.sweep(index).cloud.xyz + np.array([0.0, 0.0, _HEIGHT_M], np.float32)
+        rows.append(descriptor.row(descriptor.describe(xyz)))
+    table = np.array(rows)
+    found = candidates(lambda i, m: descriptor.compare(table[i], table[:m])[0], poses[:, :3, 3])
+    return protocol_1(found), count_revisits(poses).loops
+
+
+def spaced(drive: SimulatedDrive) -> tuple[list[int], se3.Array]:
+    """Return sweeps at least a metre apart, and their poses."""
+    poses = drive.truth().T_world_body
+    kept = [0]
+    for index in range(1, len(poses)):
+        if np.linalg.norm(poses[index, :3, 3] - poses[kept[-1], :3, 3]) >= 0.95 * _SPACING_M:
+            kept.append(index)
+    return kept, poses[kept]
+
+
+def kiss_icp(work: Path, towns: int = 3, length_m: float = 1200.0) -> dict[str, Any]:
+    """Return KISS-ICP's drift on simulated drives by KITTI's metric, percent."""
+    del work
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+    from kiss_icp.metrics import sequence_error
+
+    drifts = {}
+    for seed in TEST_SEEDS[:towns]:
+        drive = SimulatedDrive(seed, journey=JourneyConfig(length=length_m))
+        settings = load_config(None)
+        settings.data.max_range, settings.data.min_range = 100.0, 1.5
+        settings.data.deskew, settings.mapping.voxel_size = False, 1.0
+        odometry = KissICP(settings)
+        truth = drive.truth().T_world_body
+        poses: list[NDArray[np.float64]] = []
+        for index in range(len(truth)):
+            xyz = drive.sweep(index).cloud.xyz.astype(np.float64)
+            odometry.register_frame(xyz, np.empty(0))
+            poses.append(odometry.last_pose.copy())
+        mounted = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, _HEIGHT_M])
+        expected = [T @ mounted for T in truth]
+        drift, rotation = sequence_error(expected, poses)
+        drifts[f'town_{seed}'] = {'percent': float(drift), 'deg_per_m': float(rotation)}
+    return {
+        'kiss_icp_drift_percent': float(np.mean([d['percent'] for d in drifts.values()])),
+        'kiss_icp': drifts,
+    }
+
+
+def live(work: Path, seconds: float = 600.0) -> dict[str, Any]:
+    """Play a simulated 10 Hz drive at 1x through DDS to the three nodes."""
+    from benchmarks.nodes.live_run import run_live
+
+    bag = work / f'town_{seconds:.0f}s'
+    if not bag.is_dir():
+        bags = str(Path(sys.executable).parent / 'bags')
+        subprocess.run(
+            [bags, 'convert', f'town:{TEST_SEEDS[0]}', '--out', str(bag), '--points-only',
+             '--duration', str(seconds)],
+            check=True,
+        )  # fmt: skip
+    result = run_live(bag, {'lidar_odometry': ['min_range:=2.0']}, work / 'town_live_log')
+    recorder = result.recorder
+    sent = recorder.scan_published_ns
+    latencies = np.array(recorder.latencies_ms())
+    return {
+        'live_10hz': {
+            'scans': len(sent),
+            'odometry_lost': len(sent) - len(recorder.odometry_published_ns),
+            'odometry_latency_p50_ms': float(np.percentile(latencies, 50)),
+            'odometry_latency_p99_ms': float(np.percentile(latencies, 99)),
+            'keyframes': len(recorder.keyframes),
+            'loops_accepted': sum(loop.status.name == 'ACCEPTED' for loop in recorder.loops),
+        }
+    }
