@@ -10,9 +10,11 @@ import torch
 from bags.simulation.drive import SensorsConfig, SimulatedDrive
 from bags.simulation.embree import EmbreeCaster
 from bags.simulation.itinerary import JourneyConfig
+from bags.simulation.journey import Journey
 from bags.simulation.lidar_model import LIDARS
 from bags.simulation.raster import LidarRaster
-from bags.simulation.stream import TEST_SEEDS, StreamConfig, SweepStream, measured_sweep
+from bags.simulation.stream import TEST_SEEDS, measured_sweep
+from bags.simulation.town import SimulatedTown
 from lcd_common import se3
 
 _WITHIN_M = 0.01
@@ -43,13 +45,15 @@ def evaluate(work: Path, sweeps: int = 100, frames: int = 40) -> dict[str, Any]:
 
 
 def _torch_rate(device: str, sweeps: int) -> float:
-    stream = SweepStream(TEST_SEEDS[:1], StreamConfig(towns_held=1, runs=1), device=device)
-    first = next(stream.sweeps())
-    raster = next(iter(stream._held[0].rasters.values()))
-    rng = np.random.default_rng(0)
+    town, rng = SimulatedTown(TEST_SEEDS[0]), np.random.default_rng(0)
+    journey = Journey(town.streets, town.ground, JourneyConfig(length=300.0), seed=0, run=0)
+    raster = LidarRaster(town.scene(0), LIDARS['hdl64'], device)
+    times = np.linspace(0.0, journey.duration_s, sweeps)
+    poses = journey.T_world_base(times) @ _UP
+    points, _ = measured_sweep(raster, poses[0], 0.0, rng)
     begin = time.perf_counter()
-    for _ in range(sweeps):
-        points, _ = measured_sweep(raster, first.T_world_lidar, 0.0, rng)
+    for T, time_s in zip(poses, times, strict=True):
+        points, _ = measured_sweep(raster, T, float(time_s), rng)
     float(points.sum())  # waits for the device
     return sweeps / (time.perf_counter() - begin)
 
