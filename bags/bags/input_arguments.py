@@ -13,7 +13,8 @@ def add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'input',
         metavar='INPUT',
-        help='a bag (.mcap, .db3, .bag or folder), a data set folder, or the word street',
+        help='a bag (.mcap, .db3, .bag or folder), a data set folder, street (a small made-up '
+        'town), or town:SEED[:RUN] (a simulated one; see bags simulate)',
     )
     parser.add_argument('--format', choices=FORMATS, help='of a folder that is not recognised')
     parser.add_argument('--sequence', metavar='NN', help='of a data set that holds several')
@@ -26,7 +27,7 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         'topic; an empty one leaves the role out; repeat for more',
     )
     street = parser.add_argument_group(
-        'the made-up town', 'INPUT street or street:ROUTE, with ROUTE loop or abrupt_u_turn'
+        'the small made-up town', 'INPUT street or street:ROUTE, with ROUTE loop or abrupt_u_turn'
     )
     street.add_argument('--seed', type=int, default=0, help='another town (default: %(default)s)')
     street.add_argument(

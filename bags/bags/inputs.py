@@ -1,11 +1,11 @@
-"""Open what a user names: a bag, a data set folder, or the word `street`."""
+"""Open what a user names: a bag, a data set folder, or a made-up `street` or `town`."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 from bags.drives import open_drive
 from bags.records import Drive
-from lcd_common.errors import DataError
+from lcd_common.errors import ConfigError, DataError
 
 
 def open_input(
@@ -15,7 +15,13 @@ def open_input(
     sequence: str | None = None,
     topics: Mapping[str, str] | None = None,
 ) -> Drive:
-    """Open a drive as `open_drive` does; `street` and `street:ROUTE` are the analytic town."""
+    """Open a drive as `open_drive` does.
+
+    `street` and `street:ROUTE` are the analytic town; `town`, `town:SEED` and `town:SEED:RUN`
+    are drives through simulated ones.
+    """
+    if is_town(name):
+        return _town(str(name))
     if is_street(name):
         from bags.street import StreetDrive  # scipy: only for those who drive there
 
@@ -26,6 +32,21 @@ def open_input(
 def is_street(name: str | Path) -> bool:
     """Tell whether a name means the analytic town; a file or folder of that name comes first."""
     return str(name).partition(':')[0] == 'street' and not Path(name).exists()
+
+
+def is_town(name: str | Path) -> bool:
+    """Tell whether a name means a simulated town; a file or folder of that name comes first."""
+    return str(name).partition(':')[0] == 'town' and not Path(name).exists()
+
+
+def _town(name: str) -> Drive:
+    numbers = name.split(':')[1:] or ['0']
+    if len(numbers) > 2 or not all(text.isdecimal() for text in numbers):
+        raise ConfigError(f'a simulated town is town:SEED or town:SEED:RUN, got {name!r}')
+    from bags.simulation.drive import SimulatedDrive  # scipy: only for those who drive there
+
+    seed, run = int(numbers[0]), int(numbers[1]) if len(numbers) > 1 else 0
+    return SimulatedDrive(seed, run)
 
 
 def span_ns(

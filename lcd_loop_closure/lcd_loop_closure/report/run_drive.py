@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from bags.drives import FORMATS
-from bags.inputs import open_input, span_ns
+from bags.inputs import is_street, is_town, open_input, span_ns
 from bags.records import Drive
 from lcd_common import se3
 from lcd_common.command_line import run
@@ -28,6 +28,7 @@ _EXAMPLES = """
 examples:
   run_drive                                        a made-up street; see results/street_loop
   run_drive street:abrupt_u_turn                   another route there
+  run_drive town:3                                 a simulated town; town:3:1 is another time
   run_drive drive.mcap --out results/monday        a rosbag2 (mcap, sqlite3) or rosbag1
   run_drive kitti/sequences/00                     KITTI, KITTI-360, MulRan, Argoverse 2
   run_drive kitti --sequence 07 --threads 1        byte for byte the same on every run
@@ -48,8 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    street = arguments.input.partition(':')[0] == 'street'
-    if street and (arguments.format or arguments.sequence or arguments.topic):
+    made_up = is_street(arguments.input) or is_town(arguments.input)
+    if made_up and (arguments.format or arguments.sequence or arguments.topic):
         raise ConfigError('--format, --sequence and --topic choose from a recording; name one')
     drive = open_input(
         arguments.input,
@@ -139,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add('input', nargs='?', default='street', metavar='INPUT',
-        help='bag, data set folder, or street[:ROUTE] (default: street)')  # fmt: skip
+        help='bag, data set folder, street[:ROUTE], town:SEED[:RUN] (default: street)')  # fmt: skip
     add('--out', type=Path, metavar='FOLDER', help='for the results (default: results/NAME)')
     add('--overwrite', action='store_true', help='replace earlier results in the folder')
     add('--format', choices=list(FORMATS), help='format of INPUT (default: recognised)')
