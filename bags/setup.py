@@ -30,6 +30,7 @@ setup(
         'pyyaml',
         'rosbags',
         'scipy',
+        'torch',
         'tqdm',
         'zstandard',
     ],
