@@ -80,7 +80,7 @@ def strided_map(
     *,
     covered: bool,
 ) -> KernelMap:
-    """Map a tensor onto a coarser grid: out(q) = sum over taps o of W(o) in(q stride - padding + o).
+    """Map a tensor onto a coarser grid: out(q) = sum over taps o: W(o) in(q stride - padding + o).
 
     Args:
         tensor: the input.
