@@ -18,7 +18,8 @@ from lcd_common.errors import ConfigError
 _ROWS = 47  # of a band: what is worked on at a time stays in the processor's cache
 _SUN = np.array([[2.75], [2.60], [2.35]], np.float32)
 _AMBIENT = np.array([[1.12], [1.22], [1.38]], np.float32)
-_HAZE_M = 900.0
+_HAZE_M = 1400.0
+_LEVEL_LIGHT = 1.75  # on level ground, in units of the exposure
 _MIDDLE, _BESIDE = np.float32(0.76), np.float32(0.12)  # of the lens's blur
 _NOISE_LEVELS = 2.0  # of 255; the same at all brightnesses, as shot noise is after a square root
 _LEVEL = (Kind.ROAD, Kind.PAVING, Kind.GRASS)
@@ -67,6 +68,12 @@ class CameraRenderer:
         to_sun = scene.light.to_sun / np.linalg.norm(scene.light.to_sun)
         self._to_sun = to_sun.astype(np.float32)
         self._noise = np.random.default_rng(7).standard_normal(1 << 22, np.float32) * _NOISE_LEVELS
+        # The camera exposes by the light there is: the road is about as bright in any weather.
+        light = scene.light
+        self._ambient = _AMBIENT + np.float32(1.0 - light.sun) * (_AMBIENT.mean() - _AMBIENT)
+        level = light.sun * max(float(self._to_sun[2]), 0.4) * _SUN + light.ambient * _AMBIENT
+        wanted = _LEVEL_LIGHT * (0.75 + 0.25 * light.sun)
+        self._gain = np.float32(wanted / max(float(level.mean()), 0.05))
         self._threads = ThreadPoolExecutor(threads)
         self._camera: CameraModel | None = None
         self._rays: Floats = np.empty((3, 0), np.float32)
@@ -216,8 +223,8 @@ class CameraRenderer:
         ambient = part.normal[2] * np.float32(0.38 * scene_light.ambient)
         ambient += np.float32(0.62 * scene_light.ambient)
         colour = sun * _SUN
-        colour += ambient * _AMBIENT
-        colour *= part.albedo
+        colour += ambient * self._ambient
+        colour *= part.albedo * self._gain
         for kind, head_on in _MIRRORING.items():
             of = np.flatnonzero(part.kind == kind)
             if not len(of):
@@ -230,7 +237,7 @@ class CameraRenderer:
             direct = colour.take(of, axis=1)
             colour[:, of] = direct + share * (mirrored - direct)
         haze = np.float32(1.0) - np.exp(part.range_m * np.float32(-1.0 / _HAZE_M))
-        colour += haze * (HAZE * np.float32(0.7 + scene_light.ambient) - colour)
+        colour += haze * (HAZE - colour)
         sky = np.flatnonzero(part.kind == Kind.SKY)
         if len(sky):
             colour[:, sky] = self._sky.colour(part.directions.take(sky, axis=1))

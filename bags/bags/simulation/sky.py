@@ -25,7 +25,6 @@ class Sky:
         self._sun = np.float32(light.sun)
         # Clouds: a third of the sky in full sun, all of it without any.
         self._cover = np.float32(-0.4 + 2.4 * (1.0 - light.sun))
-        self._strength = np.float32(0.75 + 0.7 * light.ambient)
 
     def colour(self, directions: Floats) -> Floats:
         """Return the light [3 x N] from world directions [3 x N]; below the horizon, the ground."""
@@ -43,5 +42,4 @@ class Sky:
         colour += np.float32(0.5) * self._sun * glow
         below = np.clip(directions[2] * np.float32(-8.0), 0.0, 1.0)
         colour += below * (_GROUND - colour)
-        colour *= self._strength
         return colour

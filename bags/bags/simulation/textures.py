@@ -92,8 +92,8 @@ class Textures:
     def _road(self, patch: Patch) -> Floats:
         """Asphalt: grain, worn and mended places."""
         worn = self._noise(patch, 0.11)
-        bright = 1.0 + 0.13 * self._noise(patch, 0.012) + 0.10 * worn
-        bright -= 0.18 * (worn > 1.6) * self._fade(patch, 0.3)
+        bright = 1.0 + 0.13 * self._noise(patch, 0.012) + 0.07 * worn
+        bright -= 0.10 * (worn > 1.6) * self._fade(patch, 0.3)
         return patch.tint * bright
 
     def _paving(self, patch: Patch) -> Floats:
