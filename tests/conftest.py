@@ -15,6 +15,18 @@ os.environ.setdefault('RCUTILS_LOGGING_USE_STDOUT', '0')
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 
 
+@pytest.fixture(scope='session', autouse=True)
+def one_registration_thread() -> None:
+    """Let KISS-ICP use one thread in the whole session, whichever test comes first.
+
+    Its number of threads belongs to the process; with more than one, runs repeat but for the last
+    bits, and a test of repeated bytes would depend on the tests before it.
+    """
+    from lcd_loop_closure.kiss_registration import KissRegistration
+
+    KissRegistration(max_range=100.0, min_range=0.0, voxel_size=1.0, max_num_threads=1)
+
+
 @pytest.fixture(scope='session')
 def real_data() -> Path:
     """Folder of real recordings beside the repository; tests that need it skip without."""
