@@ -17,8 +17,8 @@ def open_input(
 ) -> Drive:
     """Open a drive as `open_drive` does.
 
-    `street` and `street:ROUTE` are the analytic town; `town`, `town:SEED` and `town:SEED:RUN`
-    are drives through simulated ones.
+    `town` is a short drive through a simulated town, `town:SEED` and `town:SEED:RUN` are longer
+    ones through towns of a choice; `street` and `street:ROUTE` are the small analytic town.
     """
     if is_town(name):
         return _town(str(name))
@@ -40,11 +40,14 @@ def is_town(name: str | Path) -> bool:
 
 
 def _town(name: str) -> Drive:
-    numbers = name.split(':')[1:] or ['0']
+    numbers = name.split(':')[1:]
     if len(numbers) > 2 or not all(text.isdecimal() for text in numbers):
         raise ConfigError(f'a simulated town is town:SEED or town:SEED:RUN, got {name!r}')
-    from bags.simulation.drive import SimulatedDrive  # scipy: only for those who drive there
+    from bags.simulation.demonstration import demonstration  # scipy: only for those who drive there
+    from bags.simulation.drive import SimulatedDrive
 
+    if not numbers:
+        return demonstration()
     seed, run = int(numbers[0]), int(numbers[1]) if len(numbers) > 1 else 0
     return SimulatedDrive(seed, run)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bags.simulation.hits import Hits
 from bags.simulation.lidar_measurement import (
     Surfaces,
+    beam_directions,
     beam_errors,
     draw,
     measure,
@@ -68,6 +69,7 @@ class LidarSensor:
         self.model, self._caster = model, caster
         self._shape = (model.columns, len(model.elevation_rad))
         self._directions = model.directions().astype(np.float32)
+        self._beams = beam_directions(model, seed)
         self._open = np.flatnonzero(model.open_columns())
         self._beam_error_m = beam_errors(model, seed)
 
@@ -126,10 +128,10 @@ class LidarSensor:
         for part, at in zip(parts, times, strict=True):
             T = T_world_lidar.astype(np.float32)
             if T.ndim == 2:
-                directions = self._directions[part] @ T[:3, :3].T
+                directions = self._beams[part] @ T[:3, :3].T
                 origins = T[None, :3, 3]
             else:
-                directions = self._directions[part] @ T[part, :3, :3].swapaxes(1, 2)
+                directions = self._beams[part] @ T[part, :3, :3].swapaxes(1, 2)
                 origins = np.repeat(T[part, :3, 3], beams, axis=0)
             hits = self._caster.cast(origins, directions.reshape(-1, 3), at)
             rays = (part[:, None] * beams + np.arange(beams)).ravel()

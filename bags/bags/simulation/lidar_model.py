@@ -20,6 +20,7 @@ class LidarModel:
         min_range_m, max_range_m: nearest and farthest return.
         range_sigma_m: of the white noise of a range.
         beam_sigma_m: of the constant error that each beam has besides.
+        angle_sigma_rad: of the constant errors of each beam's elevation and azimuth.
         range_step_m: quantisation of ranges; 0 is none.
         divergence_rad: full angle of a beam; at edges it returns two ranges or a mixed one.
         reach_m: at which half of the returns of a 10 % reflector at normal incidence are lost.
@@ -36,6 +37,7 @@ class LidarModel:
     max_range_m: float = 120.0
     range_sigma_m: float = 0.02
     beam_sigma_m: float = 0.01
+    angle_sigma_rad: float = 0.0005
     range_step_m: float = 0.002
     divergence_rad: float = 0.002
     reach_m: float = 75.0

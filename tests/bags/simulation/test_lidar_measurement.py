@@ -8,6 +8,7 @@ import pytest
 from bags.simulation.lidar_measurement import (
     Echoes,
     Surfaces,
+    beam_directions,
     beam_errors,
     draw,
     measure,
@@ -47,6 +48,17 @@ def test_beams_of_another_sensor_err_otherwise() -> None:
     errors = np.array([beam_errors(HDL64, seed) for seed in range(200)])
     assert errors.std() == pytest.approx(HDL64.beam_sigma_m, rel=0.05)
     assert not np.array_equal(errors[0], errors[1])
+
+
+def test_beams_point_where_the_calibration_almost_says() -> None:
+    true = np.array([beam_directions(HDL64, seed)[::200] for seed in range(60)], np.float64)
+    angle = np.arcsin(true[..., 2]) - HDL64.elevation_rad
+    assert angle.std() == pytest.approx(HDL64.angle_sigma_rad, rel=0.05)
+    azimuth = np.arctan2(true[..., 1], true[..., 0]) - HDL64.azimuth_rad()[::200, None]
+    assert np.angle(np.exp(1j * azimuth)).std() == pytest.approx(HDL64.angle_sigma_rad, rel=0.05)
+    np.testing.assert_allclose(np.linalg.norm(true, axis=-1), 1.0, atol=1e-6)
+    ideal = beam_directions(replace(HDL64, angle_sigma_rad=0.0), 1)
+    np.testing.assert_allclose(ideal, HDL64.directions(), atol=1e-6)
 
 
 def test_ranges_are_quantised() -> None:
