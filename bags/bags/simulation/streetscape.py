@@ -11,7 +11,7 @@ class Streetscape:
         house_gap: between neighbours, or None for no houses.
         house_width, house_depth, setback: of houses; setback from the land behind the kerb.
         storeys: (least, most).
-        tree_gap, hedge_gap, lamp_gap, car_gap: between things of a row; None for none.
+        tree_gap, hedge_gap, shrub_gap, lamp_gap, car_gap: between things of a row; None for none.
         second_row: houses behind the houses.
         hall: long, low, windowless buildings instead of houses.
     """
@@ -23,6 +23,7 @@ class Streetscape:
     storeys: tuple[int, int] = (1, 4)
     tree_gap: tuple[float, float] | None = (5.0, 22.0)
     hedge_gap: tuple[float, float] | None = (2.0, 12.0)
+    shrub_gap: tuple[float, float] | None = (1.5, 9.0)
     lamp_gap: tuple[float, float] | None = (17.0, 31.0)
     car_gap: tuple[float, float] | None = (0.7, 15.0)
     second_row: bool = True
@@ -32,7 +33,7 @@ class Streetscape:
 STREETSCAPES = {
     'urban': Streetscape(
         house_gap=(0.0, 1.0), setback=(0.2, 1.2), storeys=(3, 6), tree_gap=(12.0, 45.0),
-        hedge_gap=None, car_gap=(0.6, 6.0),
+        hedge_gap=None, shrub_gap=(8.0, 40.0), car_gap=(0.6, 6.0),
     ),
     'residential': Streetscape(
         house_gap=(2.0, 10.0), house_width=(7.0, 14.0), setback=(3.0, 8.0), storeys=(1, 3),
@@ -53,7 +54,8 @@ STREETSCAPES = {
     # The same house, tree and lamp again and again, as in an estate.
     'aliased': Streetscape(
         house_gap=(4.0, 4.0), house_width=(10.0, 10.0), house_depth=(9.0, 9.0), setback=(3.0, 3.0),
-        storeys=(2, 2), tree_gap=(14.0, 14.0), hedge_gap=None, lamp_gap=(28.0, 28.0),
+        storeys=(2, 2), tree_gap=(14.0, 14.0), hedge_gap=None, shrub_gap=None,
+        lamp_gap=(28.0, 28.0),
         car_gap=(2.0, 20.0), second_row=False,
     ),
 }  # fmt: skip

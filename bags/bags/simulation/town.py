@@ -16,6 +16,7 @@ from lcd_common import se3
 
 _REACH_M = 60.0
 _CELL_M = 1.0
+_FINENESS = 3  # of the leaves
 _LEAVES = (1.0, 0.75, 0.45, 0.12)  # share on the trees: summer .. winter
 
 
@@ -129,7 +130,13 @@ class SimulatedTown:
                     at = foot + (half + away + (0.0 if aliased else rng.uniform(0, 1.5))) * outward
                     own = np.random.default_rng(8 if aliased else int(rng.integers(1 << 31)))
                     if self._land.claim(at, 0.8, 0.8, 0.0, 0.4):
-                        shapes.tree(mesh, self._on_ground(at), own, leaves)
+                        shapes.tree(mesh, self._on_ground(at), own, leaves, _FINENESS)
+            for away in (3.0, 9.0, 16.0):
+                for s in _row(edge, scape.shrub_gap, rng):
+                    foot, _, outward = _beside(edge, s, side)
+                    at = foot + (half + away + rng.uniform(-1.5, 4.0)) * outward
+                    if self._land.claim(at, 0.8, 0.8, 0.0, 2.2):
+                        shapes.shrub(mesh, self._on_ground(at), rng)
             for s in _row(edge, scape.hedge_gap, rng):
                 length = float(rng.uniform(3.0, 12.0))
                 foot, along, outward = _beside(edge, s + length / 2, side)

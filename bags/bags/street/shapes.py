@@ -128,11 +128,16 @@ def car(
 
 
 def tree(
-    mesh: MeshBuilder, foot: Array, rng: np.random.Generator, leaves_mesh: MeshBuilder | None = None
+    mesh: MeshBuilder,
+    foot: Array,
+    rng: np.random.Generator,
+    leaves_mesh: MeshBuilder | None = None,
+    fineness: int = 1,
 ) -> None:
     """Add a tree: a trunk, and leaves as loose triangles in an ellipsoid or a cone.
 
-    The leaves go into a mesh of their own where one is given.
+    The leaves go into a mesh of their own where one is given; there are `fineness` times as many,
+    and as much smaller.
     """
     height = rng.uniform(3.5, 11.0)
     trunk = rng.uniform(0.2, 0.45) * height
@@ -140,16 +145,28 @@ def tree(
     mesh.prism(foot - up(0.3), trunk + 1.0, rng.uniform(0.08, 0.28), Material.BARK)
     mesh.label = Label.VEGETATION
     radius = rng.uniform(0.9, 2.6)
-    count = int(rng.integers(90, 220))
+    count = fineness * int(rng.integers(90, 220))
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     at = direction * np.cbrt(rng.uniform(0.2, 1.0, (count, 1)))
     if rng.random() < 0.3:  # a conifer
         at[:, :2] *= 0.5 * (1.0 - at[:, 2:])
     crown = at * [radius, radius, (height - trunk) / 2] + up((height + trunk) / 2)
-    leaves = crown[:, None] + rng.normal(0.0, 0.22, (count, 3, 3)) + foot
+    size = 0.22 / np.sqrt(fineness)
+    leaves = crown[:, None] + rng.normal(0.0, size, (count, 3, 3)) + foot
     mesh = leaves_mesh or mesh
     mesh.label = Label.VEGETATION
+    mesh.triangles(leaves.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), Material.LEAF)
+
+
+def shrub(mesh: MeshBuilder, foot: Array, rng: np.random.Generator) -> None:
+    """Add a shrub, a few of them grown together, or a heap of whatever stands in gardens."""
+    mesh.label = Label.VEGETATION
+    radius, height = float(rng.uniform(0.4, 1.6)), float(rng.uniform(0.4, 2.4))
+    count = int(60 * radius * height) + 20
+    at = rng.normal(0.0, 0.5, (count, 3)) * [radius, radius, 0.6 * height] + up(0.5 * height)
+    leaves = at[:, None] + rng.normal(0.0, 0.12, (count, 3, 3)) + foot
+    leaves[..., 2] = np.maximum(leaves[..., 2], foot[2] - 0.1)
     mesh.triangles(leaves.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), Material.LEAF)
 
 
