@@ -89,6 +89,12 @@ def simulated_sweeps(model: LidarModel, towns: Sequence[int] = _TOWNS) -> list[R
     return sweeps
 
 
+def evaluate(work: Path) -> dict[str, Any]:
+    """Return the figures as a section of `benchmarks.town`."""
+    del work
+    return {'real_vs_sim': figures()}
+
+
 def figures() -> dict[str, Any]:
     """Return real against simulated, one entry per statistic and recording.
 

@@ -77,6 +77,7 @@ class CameraRenderer:
         self._threads = ThreadPoolExecutor(threads)
         self._camera: CameraModel | None = None
         self._rays: Floats = np.empty((3, 0), np.float32)
+        self._rays_of_frame: Floats = np.empty((0, 6), np.float32)
 
     def render(
         self,
@@ -126,9 +127,21 @@ class CameraRenderer:
         return CameraView(albedo, depth.reshape(size), look.found.mover.reshape(size))
 
     def _look(self, T_world_camera: se3.Array, camera: CameraModel, time_s: float) -> '_Look':
-        directions = T_world_camera[:3, :3].astype(np.float32) @ self._camera_rays(camera)
         origin = T_world_camera[:3, 3].astype(np.float32)
-        found = self._caster.nearest(origin, directions.T, time_s)
+        own, R = self._camera_rays(camera), T_world_camera[:3, :3].astype(np.float32)
+        directions, rays = np.empty_like(own), self._rays_of_frame
+        rays[:, :3] = origin
+
+        def turn(rows: slice) -> None:
+            pixels = slice(rows.start * camera.width, rows.stop * camera.width)
+            for axis in range(3):  # three products are faster than a matrix product this thin
+                turned = R[axis, 0] * own[0, pixels]
+                turned += R[axis, 1] * own[1, pixels]
+                turned += R[axis, 2] * own[2, pixels]
+                directions[axis, pixels] = rays[pixels, 3 + axis] = turned
+
+        self._each_band(camera, turn)
+        found = self._caster.nearest_along(rays, time_s)
         which = found.triangle.copy()
         moving = np.flatnonzero(found.mover >= 0)
         which[moving] += self._first[found.mover[moving] + 1]
@@ -157,6 +170,7 @@ class CameraRenderer:
         rays = np.linalg.inv(camera.K) @ pixels
         rays /= np.linalg.norm(rays, axis=0)
         self._camera, self._rays = camera, rays.astype(np.float32)
+        self._rays_of_frame = np.empty((rays.shape[1], 6), np.float32)
         return self._rays
 
     def _shadow(self, look: '_Look', time_s: float) -> NDArray[np.bool_]:

@@ -92,8 +92,12 @@ class EmbreeCaster:
         time_s: float = 0.0,
     ) -> Nearest:
         """Return the nearest triangles and their normals; arguments as for `cast`."""
-        rays = self._rays(origins, directions)
-        found = self._standing.cast_rays(rays)
+        return self.nearest_along(_rays(origins, directions), time_s)
+
+    def nearest_along(self, rays: NDArray[np.float32], time_s: float = 0.0) -> Nearest:
+        """Return the nearest triangles along rays [N x 6]: origin, unit direction; no copy made."""
+        along = self._o3d.core.Tensor.from_numpy(rays)
+        found = self._standing.cast_rays(along)
         range_m = found['t_hit'].numpy()
         normal = found['primitive_normals'].numpy()
         # Embree says "none" by the highest number of 32 bits, which is -1 as a signed one.
@@ -101,7 +105,7 @@ class EmbreeCaster:
         mover = np.full(len(range_m), -1, np.int16)
         placed = self._movers(time_s)
         if placed is not None:
-            found = placed.tree.cast_rays(rays)
+            found = placed.tree.cast_rays(along)
             nearer = np.flatnonzero(found['t_hit'].numpy() < range_m)
             range_m[nearer] = found['t_hit'].numpy()[nearer]
             normal[nearer] = found['primitive_normals'].numpy()[nearer]
@@ -116,7 +120,7 @@ class EmbreeCaster:
         time_s: float = 0.0,
     ) -> NDArray[np.bool_]:
         """Return whether anything lies on each ray [N]; arguments as for `cast`."""
-        rays = self._rays(origins, directions)
+        rays = self._o3d.core.Tensor.from_numpy(_rays(origins, directions))
         blocked = np.asarray(self._standing.test_occlusions(rays).numpy())
         placed = self._movers(time_s)
         if placed is not None:
@@ -137,14 +141,15 @@ class EmbreeCaster:
             self._placed = _Placed(time_s, tree, np.array(present, np.int16))
         return self._placed if len(self._placed.index) else None
 
-    def _rays(self, origins: NDArray[np.floating], directions: NDArray[np.floating]) -> Any:
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origins, directions
-        return self._o3d.core.Tensor.from_numpy(rays)
-
     def _tree(self) -> Any:
         return self._o3d.t.geometry.RaycastingScene()
 
     def _add(self, tree: Any, vertices: NDArray[np.float32], of: NDArray[np.uint32]) -> None:
         tensor = self._o3d.core.Tensor
         tree.add_triangles(tensor(vertices), tensor(of))
+
+
+def _rays(origins: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.float32]:
+    rays = np.empty((len(directions), 6), np.float32)
+    rays[:, :3], rays[:, 3:] = origins, directions
+    return rays
