@@ -33,19 +33,26 @@ def scan_context(work: Path, towns: int = 3) -> dict[str, Any]:
     for name, journey in _JOURNEYS.items():
         curves = {}
         for seed in TEST_SEEDS[:towns]:
-            curve, loops = judge(SimulatedDrive(SimulatedTown(seed), journey=journey))
-            curves[f'town_{seed}'] = {'average_precision': curve.average_precision, 'loops': loops}
+            curve, places = judge(SimulatedDrive(SimulatedTown(seed), journey=journey))
+            curves[f'town_{seed}'] = {'average_precision': curve.average_precision, **places}
         figures[name] = float(np.mean([c['average_precision'] for c in curves.values()]))
         figures[f'{name}_by_town'] = curves
     aliased = SimulatedDrive(
         SimulatedTown(TEST_SEEDS[-1], 'aliased'), journey=_JOURNEYS['same_way']
     )
-    figures['aliased_same_way'] = judge(aliased)[0].average_precision
+    curve, places = judge(aliased)
+    figures['aliased_same_way'] = curve.average_precision
+    figures['aliased_same_way_by_town'] = places
     return {'scan_context_ap': figures}
 
 
-def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, int]:
-    """Describe a drive by Scan Context; return its curve and how many scans are loops."""
+def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, dict[str, float]]:
+    """Describe a drive by Scan Context; return its curve and how distinct its places are.
+
+    The latter are medians over scans that return to a place: of the distance to the nearest scan of
+    that place, to the most similar scan of another place (more than 20 m away), and to any other
+    place; and the share of them that another place is more like (perceptual aliasing).
+    """
     descriptor = ScanContext(ScanContextConfig())
     kept, poses = spaced(drive)
     rows = []
@@ -54,7 +61,21 @@ def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, int]:
         rows.append(descriptor.row(descriptor.describe(xyz)))
     table = np.array(rows)
     found = candidates(lambda i, m: descriptor.compare(table[i], table[:m])[0], poses[:, :3, 3])
-    return protocol_1(found), count_revisits(poses).loops
+    within, nearest_other, between = [], [], []
+    for query in found.query[found.loop]:
+        earlier = int(query) - 49
+        distance = descriptor.compare(table[query], table[:earlier])[0]
+        away = np.linalg.norm(poses[:earlier, :3, 3] - poses[query, :3, 3], axis=1)
+        within.append(distance[away <= 4.0].min())
+        nearest_other.append(distance[away > 20.0].min())
+        between.append(np.median(distance[away > 20.0]))
+    return protocol_1(found), {
+        'loops': count_revisits(poses).loops,
+        'distance_within_a_place': float(np.median(within)),
+        'distance_to_most_similar_other_place': float(np.median(nearest_other)),
+        'distance_between_places': float(np.median(between)),
+        'aliased_share': float(np.mean(np.array(nearest_other) < np.array(within))),
+    }
 
 
 def spaced(drive: SimulatedDrive) -> tuple[list[int], se3.Array]:
