@@ -31,7 +31,7 @@ help: ## list the targets
 	@printf 'usage: make TARGET [VARIABLE=value ...]\n\n'
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@printf '%s\n' '' 'variables' \
-	  '  BAG, DATA    a bag file or a data set folder for make demo; with neither, a made-up street' \
+	  '  BAG, DATA    a bag file or a data set folder for make demo; with neither, a simulated town' \
 	  '  OUT          folder for the results of make demo (default: results/demo, replaced every time)' \
 	  '  ARGS         more arguments: for pytest in make test, for run_drive in make demo' \
 	  '  PYTHON       Python 3.11 or 3.12 of the environment (default: the first that runs)' \
@@ -45,7 +45,7 @@ help: ## list the targets
 setup: $(STAMPS)/packages ## create the environment with everything in it (demo and test do this themselves)
 
 .PHONY: demo
-demo: setup ## drive a made-up street, or BAG=drive.mcap, or DATA=folder; results in OUT
+demo: setup ## drive a simulated town, or BAG=drive.mcap, or DATA=folder; results in OUT
 	@if [[ -n '$(BAG)' && -n '$(DATA)' ]]; then \
 	  echo 'error: make demo takes BAG= or DATA=, not both' >&2; exit 2; fi
 	@$(RUN) run_drive $(if $(BAG)$(DATA),'$(BAG)$(DATA)') --out '$(OUT)' \

@@ -64,7 +64,7 @@ def test_a_kitti_folder_reads_as_it_was_driven(tmp_path: Path) -> None:
 
 def test_a_town_is_an_input() -> None:
     named = open_input('town:3:1')
-    assert (named.name, open_input('town').name) == ('town_3_run1', 'town_0_run0')
+    assert (named.name, open_input('town').name) == ('town_3_run1', 'town_99_run0')
     assert {s.topic for s in named.streams()} >= {'/points', '/imu', '/gps/fix'}
 
 

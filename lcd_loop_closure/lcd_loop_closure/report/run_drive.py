@@ -26,9 +26,9 @@ from lcd_loop_closure.report.summary import summary
 
 _EXAMPLES = """
 examples:
-  run_drive                                        a made-up street; see results/street_loop
-  run_drive street:abrupt_u_turn                   another route there
-  run_drive town:3                                 a simulated town; town:3:1 is another time
+  run_drive                                        a simulated town; see results/town_99_run0
+  run_drive town:3                                 1.5 km in another; town:3:1 on another day
+  run_drive street:abrupt_u_turn                   a small made-up street and its routes
   run_drive drive.mcap --out results/monday        a rosbag2 (mcap, sqlite3) or rosbag1
   run_drive kitti/sequences/00                     KITTI, KITTI-360, MulRan, Argoverse 2
   run_drive kitti --sequence 07 --threads 1        byte for byte the same on every run
@@ -139,8 +139,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add('input', nargs='?', default='street', metavar='INPUT',
-        help='bag, data set folder, street[:ROUTE], town:SEED[:RUN] (default: street)')  # fmt: skip
+    add('input', nargs='?', default='town', metavar='INPUT',
+        help='bag, data set folder, town[:SEED[:RUN]], street[:ROUTE] (default: town)')  # fmt: skip
     add('--out', type=Path, metavar='FOLDER', help='for the results (default: results/NAME)')
     add('--overwrite', action='store_true', help='replace earlier results in the folder')
     add('--format', choices=list(FORMATS), help='format of INPUT (default: recognised)')

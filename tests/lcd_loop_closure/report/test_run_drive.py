@@ -40,15 +40,15 @@ def nodes(result: DriveResult, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     return nodes
 
 
-def test_without_arguments_a_street_is_driven(
+def test_without_arguments_a_town_is_driven(
     nodes: _Nodes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['--no-plots']) == 0
-    assert nodes.asked['drive'].name == 'street_loop'
+    assert nodes.asked['drive'].name == 'town_99_run0'
     out = capsys.readouterr().out
-    assert 'results/street_loop/report.html' in out
+    assert 'results/town_99_run0/report.html' in out
     assert '20 true, 2 false' in out and 'ATE' in out and 'truncated velodyne file' in out
-    assert Path('results/street_loop/report.html').is_file()
+    assert Path('results/town_99_run0/report.html').is_file()
 
 
 def test_options_reach_the_nodes(nodes: _Nodes, tmp_path: Path) -> None:
