@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from bags.records import CameraModel
 from bags.simulation.appearance import Appearance, Floats, Kind, appearance_of, plane_axes
@@ -20,6 +21,7 @@ _SUN = np.array([[2.75], [2.60], [2.35]], np.float32)
 _AMBIENT = np.array([[1.12], [1.22], [1.38]], np.float32)
 _HAZE_M = 1400.0
 _LEVEL_LIGHT = 1.75  # on level ground, in units of the exposure
+_NEAR_M, _NEAR_SHADE = 2.0, np.float32(0.8)  # overcast: what is so near above takes that much
 _MIDDLE, _BESIDE = np.float32(0.76), np.float32(0.12)  # of the lens's blur
 _NOISE_LEVELS = 2.0  # of 255; the same at all brightnesses, as shot noise is after a square root
 _LEVEL = (Kind.ROAD, Kind.PAVING, Kind.GRASS)
@@ -68,6 +70,12 @@ class CameraRenderer:
         to_sun = scene.light.to_sun / np.linalg.norm(scene.light.to_sun)
         self._to_sun = to_sun.astype(np.float32)
         self._noise = np.random.default_rng(7).standard_normal(1 << 22, np.float32) * _NOISE_LEVELS
+        upwards = np.random.default_rng(8).standard_normal((4099, 3), np.float32)
+        upwards /= np.linalg.norm(upwards, axis=1, keepdims=True)
+        upwards[:, 2] += np.float32(
+            1.001
+        )  # then they are spread as a diffuse surface gathers light
+        self._upwards = upwards / np.linalg.norm(upwards, axis=1, keepdims=True)
         # The camera exposes by the light there is: the road is about as bright in any weather.
         light = scene.light
         self._ambient = _AMBIENT + np.float32(1.0 - light.sun) * (_AMBIENT.mean() - _AMBIENT)
@@ -90,8 +98,8 @@ class CameraRenderer:
 
         Light is added up per colour: the sun where nothing is in its way (asked once for 2 x 2
         pixels), the sky's from above, mirrored sky in glass and paint, haze. The lens blurs by
-        about half a pixel. Not modelled: light from surface to surface (it is as dark under a car
-        as in any shadow), lens flare, motion blur, a rolling shutter.
+        about half a pixel. Not modelled: light from surface to surface (in the sun, it is as dark
+        below a car as in any shadow), lens flare, motion blur, a rolling shutter.
 
         Args:
             T_world_camera: pose of the optical frame (z ahead, x right, y down).
@@ -173,22 +181,32 @@ class CameraRenderer:
         self._rays_of_frame = np.empty((rays.shape[1], 6), np.float32)
         return self._rays
 
-    def _shadow(self, look: '_Look', time_s: float) -> NDArray[np.bool_]:
-        """Return whether something is between pixels and the sun [H/2 x W/2, rounded up]."""
+    def _shadow(self, look: '_Look', time_s: float) -> Floats:
+        """Return how much less light there is [H/2 x W/2, rounded up], 0..1.
+
+        That is where the sun does not reach or, under an overcast sky, where level ground has
+        something less than 2 m above it: a car.
+        """
         height, width = look.camera.height, look.camera.width
         at = (np.arange(0, height, 2)[:, None] * width + np.arange(0, width, 2)).ravel()
+        shadow = np.zeros(len(at), np.float32)
         shape = (height + 1) // 2, (width + 1) // 2
-        shadow = np.zeros(len(at), bool)
-        if self._caster.scene.light.sun <= 0.0:
-            return shadow.reshape(shape)
+        has_sun = self._caster.scene.light.sun > 0.0
         range_m, directions = look.found.range_m[at], look.directions[:, at]
-        ask = np.flatnonzero(np.isfinite(range_m))
+        asked = np.isfinite(range_m)
+        if not has_sun:
+            asked &= np.abs(look.found.normal[at, 2]) > 0.9
+        ask = np.flatnonzero(asked)
         # A little back along the ray: beside the surface, on the side that is seen.
         beside = range_m[ask] * np.float32(0.9995) - np.float32(0.004)
         points = look.origin + (directions[:, ask] * beside).T
-        to_sun = np.broadcast_to(self._to_sun, points.shape)
-        shadow[ask] = self._caster.blocked(points, to_sun, time_s)
-        return shadow.reshape(shape)
+        if has_sun:
+            to_sun = np.broadcast_to(self._to_sun, points.shape)
+            shadow[ask] = self._caster.blocked(points, to_sun, time_s)
+            return shadow.reshape(shape)
+        upwards = np.resize(self._upwards, points.shape)
+        shadow[ask] = self._caster.nearest(points, upwards, time_s).range_m < _NEAR_M
+        return uniform_filter(shadow.reshape(shape), 5)
 
     def _albedo(self, look: '_Look', part: '_Part') -> '_Part':
         """Paint a part: fill in its kinds and its albedo."""
@@ -224,7 +242,7 @@ class CameraRenderer:
             part.albedo[:, of] = self._textures.albedo(kind, patch)
         return part
 
-    def _shade(self, look: '_Look', rows: slice, shadow: NDArray[np.bool_], light: Floats) -> None:
+    def _shade(self, look: '_Look', rows: slice, shadow: Floats, light: Floats) -> None:
         """Write the light [3 x R x W] that comes from a band of rows."""
         part = self._albedo(look, look.part(rows))
         scene_light, width = self._caster.scene.light, look.camera.width
@@ -233,9 +251,11 @@ class CameraRenderer:
         leaves = np.flatnonzero(part.kind == Kind.LEAF)
         sun[leaves] *= np.where(sun[leaves] < 0, np.float32(-0.6), np.float32(1.0))  # shine through
         np.maximum(sun, np.float32(0.0), out=sun)
-        sun *= ~behind.ravel() * np.float32(scene_light.sun)
+        sun *= (np.float32(1.0) - behind.ravel()) * np.float32(scene_light.sun)
         ambient = part.normal[2] * np.float32(0.38 * scene_light.ambient)
         ambient += np.float32(0.62 * scene_light.ambient)
+        if scene_light.sun <= 0.0:
+            ambient *= np.float32(1.0) - _NEAR_SHADE * behind.ravel()
         colour = sun * _SUN
         colour += ambient * self._ambient
         colour *= part.albedo * self._gain

@@ -134,14 +134,32 @@ def test_shadow_lies_where_rays_to_the_sun_meet_the_box():
     assert ratio < 0.75
 
 
-def test_no_shadow_without_sun():
+def test_overcast_sky_casts_no_shadow_but_it_is_dark_below_things():
     overcast = Light(sun=0.0, ambient=0.5)
     T = camera_at(0.0, 0.0)
-    with_box, without = (
-        renderer(mesh=ground(it), light=overcast).render(T, CAMERA) for it in (True, False)
+    lifted = MeshBuilder()
+    lifted.label = Label.CAR
+    lifted.box(np.array([8.0, 0.0, 0.9]), (4.0, 3.0, 0.6), 0.0, Material.METAL)
+    road = ground()
+    both = Mesh(
+        np.concatenate([road.vertices, lifted.build().vertices]),
+        np.concatenate([road.triangles, lifted.build().triangles + np.uint32(len(road.vertices))]),
+        np.concatenate([road.materials, lifted.build().materials]),
+        np.concatenate([road.labels, lifted.build().labels]),
     )
-    beside = from_hull(project(box_corners(), T)) > 2.0
-    np.testing.assert_array_equal(with_box[beside], without[beside])
+    with_box, without = (
+        renderer(mesh=mesh, light=overcast).render(T, CAMERA).astype(float) for mesh in (both, road)
+    )
+    below = project(np.array([[6.2, 1.0, 0.0], [6.2, -1.0, 0.0]]), T).round().astype(int)
+    aside = project(np.array([[8.0, 4.5, 0.0], [8.0, -4.5, 0.0]]), T).round().astype(int)
+    (left, row), (right, _) = below
+    dark = with_box[row, left:right].mean() / without[row, left:right].mean()
+    assert dark < 0.85
+    for column, line in aside:
+        np.testing.assert_array_equal(
+            with_box[line - 1 : line + 2, column - 1 : column + 2],
+            without[line - 1 : line + 2, column - 1 : column + 2],
+        )
 
 
 def sliding(material: Material = Material.METAL, label: Label = Label.CAR) -> Mover:
