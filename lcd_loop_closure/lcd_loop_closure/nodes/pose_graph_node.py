@@ -86,7 +86,10 @@ class PoseGraphNodeConfig:
         'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
     )
     judge_period: float = setting(
-        1.0, 'shortest time between two joint verdicts on the loops', unit='s', low=0.0
+        1.0,
+        'shortest time between two joint verdicts while keyframes come, for each hundred loops',
+        unit='s',
+        low=0.0,
     )
     solver_niceness: int = setting(
         10, 'lower priority of the process that judges the loops', low=0, high=19
@@ -150,6 +153,7 @@ class PoseGraphNode(Node):
         self.base_frame = 'base_link'
         self._odometry: StampedPose | None = None
         self._shown_s = self._mapped_s = self._judged_s = -math.inf
+        self._refreshed_at: Keyframe | None = None
         self._undrawn = self._unmapped = False
 
         self._path_out = self.create_publisher(Path, 'path', qos.LATCHED)
@@ -284,7 +288,9 @@ class PoseGraphNode(Node):
     def refresh(self) -> None:
         """Show what was held back, and say whether map -> odom has another owner."""
         self._judge.hand_over()
-        self._have_judged(now=not self.config.threaded)
+        # Nothing new since the last time: what waits for its verdict need not wait longer.
+        quiet, self._refreshed_at = self.map.last is self._refreshed_at, self.map.last
+        self._have_judged(now=quiet)
         self._show(all_of_it=not self.config.threaded)
         self._pose.check_authority()
 
@@ -366,7 +372,8 @@ class PoseGraphNode(Node):
             self.show(map_cloud=map_due)
 
     def _have_judged(self, *, now: bool = False) -> None:
-        due = now or self._now_s() - self._judged_s >= self.config.judge_period
+        hundreds = max(1.0, len(self.map.graph.loops()) / 100.0)
+        due = now or self._now_s() - self._judged_s >= self.config.judge_period * hundreds
         if due and self._judge.consider(self.map.graph):
             self._judged_s = self._now_s()
 
