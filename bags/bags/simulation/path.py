@@ -11,9 +11,10 @@ from bags.simulation.street_map import StreetEdge, StreetMap
 from lcd_common import se3
 
 STEP_M = 0.25
-_CORNER_M = 10.0  # streets are left this far before their crossings
+_CORNER_M = 7.5  # streets are left this far before their crossings, past the last parked cars
 _DEAD_END_M = 6.0
 _SMOOTH_M = 1.0
+_HALF_CAR_M = 0.95
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,12 @@ class Path:
 def lane_m(edge: StreetEdge) -> float:
     """Return how far right of the centreline cars drive: clear of those parked at the kerb."""
     return float(np.clip(edge.half_width_m - 3.2, 1.3, 1.75))
+
+
+def _farthest_right_m(edge: StreetEdge) -> float:
+    """Return how far right a car may drive: nobody parks in streets narrower than 8 m."""
+    parked = 2.3 if edge.half_width_m >= 4.0 else 0.3
+    return max(edge.half_width_m - parked - _HALF_CAR_M, 1.2)
 
 
 def lay_path(
@@ -85,7 +92,7 @@ def _strip(
         rng.uniform(0.02, 0.07) * np.sin(2 * np.pi * (at / rng.uniform(35.0, 110.0) + rng.random()))
         for _ in range(3)
     )
-    shifts = np.clip(aside + wander, 0.0, max(edge.half_width_m - 2.0, 1.3))
+    shifts = np.clip(aside + wander, 0.0, _farthest_right_m(edge))
     return np.asarray(spline(at) + shifts[:, None] * right)
 
 

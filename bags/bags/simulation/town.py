@@ -40,7 +40,7 @@ class SimulatedTown:
         points = np.concatenate([edge.centreline for edge in self.streets.edges])
         halves = [np.full(len(e.centreline), e.half_width_m) for e in self.streets.edges]
         self._land = Land(points, np.concatenate(halves))
-        self._points = points
+        self._points, self._half_m = points, np.concatenate(halves)
 
     def scene(self, run: int = 0) -> Scene:
         """Return the town during a run: other cars, leaves, light, traffic and building sites."""
@@ -174,7 +174,12 @@ class SimulatedTown:
         foot, along, outward = _beside(edge, s + length / 2, side)
         at = foot + (edge.half_width_m - width / 2 - rng.uniform(0.05, 0.3)) * outward
         yaw = float(np.arctan2(along[1], along[0])) + rng.choice([0.0, np.pi])
-        shapes.car(mesh, self._on_ground(at), (length, width), yaw + rng.normal(0.0, 0.02), rng)
+        yaw += rng.normal(0.0, 0.02)
+        # Streets that meet at an acute angle overlap: nobody parks in the way of the other one.
+        within = np.linalg.norm(self._points - at, axis=1) < self._half_m + 0.9
+        own = np.linalg.norm(edge.centreline[:, None] - self._points[within], axis=2).min(axis=0)
+        if (own < 1e-6).all():
+            shapes.car(mesh, self._on_ground(at), (length, width), yaw, rng)
 
     def _on_ground(self, xy: se3.Array) -> se3.Array:
         return np.array([*xy, float(self.ground.height(xy[None])[0])])

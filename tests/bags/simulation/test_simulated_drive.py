@@ -178,6 +178,21 @@ def test_who_would_run_into_the_car_stays_at_home() -> None:
     assert kept.movers == (passing, later)
 
 
+def test_the_car_drives_through_nothing() -> None:
+    """Rays along the way, at the car's sides and heights, meet no parked car, wall or pole."""
+    drive = SimulatedDrive(3, 0, JourneyConfig(length=1200.0), VLP16)
+    time_s = np.arange(0.0, drive.journey.duration_s, 0.02)
+    half_metres = (2.0 * drive.journey.travelled(time_s)).astype(int)
+    T = drive.journey.T_world_base(time_s[np.unique(half_metres, return_index=True)[1]])
+    for side in (-0.9, 0.0, 0.9):
+        for height in (0.4, 1.0, 1.73):
+            at = T[:, :3, 3] + side * T[:, :3, 1] + height * T[:, :3, 2]
+            step = np.diff(at, axis=0)
+            metres = np.linalg.norm(step, axis=1)
+            hits = drive._caster.cast(at[:-1], step / metres[:, None], time_s=-1.0)
+            assert (hits.range_m > metres).all()
+
+
 def test_sensors_sit_where_kittis_do() -> None:
     """Published: velodyne 1.73 m, camera 1.65 m, inertial unit 0.93 m above the road."""
     mountings = {
