@@ -16,7 +16,8 @@ from bags.simulation.lidar_measurement import (
     neighbours,
 )
 from bags.simulation.lidar_model import LidarModel
-from bags.street.mesh import REFLECTIVITY, RETURN_SHARE
+from bags.simulation.reflectivity import REFLECTIVITY
+from bags.street.mesh import RETURN_SHARE
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 
@@ -144,7 +145,7 @@ class LidarSensor:
         T = np.broadcast_to(T_world_lidar, (self._shape[0], 4, 4)).astype(np.float32)
         range_m = np.where(np.isfinite(hits.range_m), hits.range_m, 0.0).reshape(*self._shape, 1)
         xyz = (range_m * self._directions) @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
-        base = REFLECTIVITY[hits.material].astype(np.float32).reshape(self._shape)
+        base = REFLECTIVITY[hits.label, hits.material].reshape(self._shape)
         return np.clip(base * patchiness(xyz), 0.02, 1.0)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bags.simulation.lidar_model import LidarModel
 
 # A rough surface (asphalt above all) sends more back at grazing angles than Lambert's cosine.
-_ROUGHNESS = 0.2
+_ROUGHNESS = 0.6
 # Echoes nearer to each other than about half a pulse melt into one range between them.
 _PULSE_M = 1.0
 _EDGE_M = 0.25

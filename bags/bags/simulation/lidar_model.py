@@ -88,14 +88,23 @@ def _evenly(top_deg: float, bottom_deg: float, beams: int) -> se3.Array:
     return np.radians(np.linspace(top_deg, bottom_deg, beams))
 
 
-# HDL-64E S2: 32 beams 1/3 degree apart from +2, 32 beams 1/2 degree apart down to -24.8 degrees.
-_HDL64 = np.radians(np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.87, -24.8, 32)])
+# KITTI's HDL-64E: medians over the rings of 24 sweeps of sequence 00, degrees.
+_HDL64 = np.radians(
+    [
+        2.64, 2.28, 2.04, 1.59, 1.31, 0.91, 0.64, 0.27, -0.07, -0.48, -0.78, -1.12, -1.50, -1.84,
+        -2.16, -2.52, -2.80, -3.18, -3.44, -3.82, -4.10, -4.45, -4.79, -5.14, -5.54, -5.85, -6.15,
+        -6.43, -6.80, -7.15, -7.39, -7.77, -8.37, -8.88, -9.33, -9.74, -10.20, -10.78, -11.28,
+        -11.72, -12.17, -12.60, -13.14, -13.64, -14.22, -14.66, -15.15, -15.52, -16.15, -16.66,
+        -17.24, -17.71, -18.19, -18.62, -19.05, -19.61, -20.11, -20.77, -21.23, -21.65, -22.09,
+        -22.71, -23.17, -23.72,
+    ]
+)  # fmt: skip
 _HDL32_LIKE = _evenly(10.67, -30.67, 32)
 
 LIDARS: dict[str, LidarModel] = {
     model.name: model
     for model in (
-        LidarModel('hdl64', _HDL64, 1875),
+        LidarModel('hdl64', _HDL64, 2083, max_range_m=80.0),  # KITTI's files end there
         LidarModel(
             'os1_64', _evenly(22.5, -22.5, 64), 1024, range_sigma_m=0.015, beam_sigma_m=0.005,
             divergence_rad=0.003, reach_m=60.0, min_range_m=0.5,

@@ -12,9 +12,10 @@ import torch
 from bags.simulation.lidar_measurement import Draws, Surfaces, beam_errors, measure, neighbours
 from bags.simulation.lidar_model import lidar_model
 from bags.simulation.raster import LidarRaster
+from bags.simulation.reflectivity import REFLECTIVITY
 from bags.simulation.street_map import StreetEdge
 from bags.simulation.town import SimulatedTown
-from bags.street.mesh import REFLECTIVITY, RETURN_SHARE
+from bags.street.mesh import RETURN_SHARE
 from lcd_common import se3
 from lcd_common.errors import ConfigError
 
@@ -194,7 +195,7 @@ def measured_sweep(
     normal = torch.randn((2, *shape), generator=generator, device=device)
     uniform = torch.rand((2, *shape), generator=generator, device=device)
     to_device = {'dtype': torch.float32, 'device': device}
-    reflectivity = torch.as_tensor(REFLECTIVITY, **to_device)[hits.material]  # type: ignore[call-overload]
+    reflectivity = torch.as_tensor(REFLECTIVITY, **to_device)[hits.label, hits.material]  # type: ignore[call-overload]
     R, t = (
         torch.as_tensor(part, **to_device) for part in (T_world_lidar[:3, :3], T_world_lidar[:3, 3])
     )  # type: ignore[call-overload]
