@@ -70,6 +70,21 @@ TABLES: dict[str, tuple[Row, ...]] = {
             ('graph_update_p99_ms_at_10000',), '≤ 50 ms'),
         Row('Memory of a keyframe', '{:.1f} kB', ('memory.bytes_per_keyframe',), '', 1e-3),
     ),
+    'town': (
+        Row('HDL-64E sweeps a second, two cores', '{:.1f}', ('sweeps_per_second_cpu',), '≥ 12'),
+        Row('— on a GPU, by the torch renderer', '{:.0f}', ('sweeps_per_second_gpu',), '≥ 300'),
+        Row('Camera frames of 1241 x 376 a second, two cores', '{:.1f}',
+            ('camera_frames_per_second_cpu',), '≥ 8'),
+        Row('Rays on which both renderers agree within 1 cm', '{:.3f} %',
+            ('renderers_within_1cm_share',), '≥ 99.9 %', 100),
+        Row('Drift of KISS-ICP', '{:.2f} %', ('kiss_icp_drift_percent',), '0.3-0.8 %'),
+        Row('Average precision of Scan Context, same way', '{:.2f}',
+            ('scan_context_ap.same_way',), '0.90-0.98'),
+        Row('— in reverse', '{:.2f}', ('scan_context_ap.reverse',), '0.50-0.80'),
+        Row('Live at 10 Hz: scans that odometry lost', '{:.0f}', ('live_10hz.odometry_lost',), '0'),
+        Row('— odometry latency, 99 %', '{:.0f} ms',
+            ('live_10hz.odometry_latency_p99_ms',), '≤ 150 ms'),
+    ),
 }  # fmt: skip
 
 
