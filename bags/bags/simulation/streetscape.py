@@ -36,7 +36,7 @@ STREETSCAPES = {
         hedge_gap=None, shrub_gap=(8.0, 40.0), car_gap=(0.6, 6.0),
     ),
     'residential': Streetscape(
-        house_gap=(2.0, 10.0), house_width=(7.0, 14.0), setback=(3.0, 8.0), storeys=(1, 3),
+        house_gap=(2.0, 10.0), house_width=(7.0, 14.0), setback=(1.5, 6.5), storeys=(1, 3),
     ),
     'avenue': Streetscape(
         house_gap=(25.0, 70.0), setback=(10.0, 18.0), tree_gap=(6.0, 9.0), hedge_gap=(5.0, 30.0),

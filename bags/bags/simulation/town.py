@@ -131,11 +131,11 @@ class SimulatedTown:
                     own = np.random.default_rng(8 if aliased else int(rng.integers(1 << 31)))
                     if self._land.claim(at, 0.8, 0.8, 0.0, 0.4):
                         shapes.tree(mesh, self._on_ground(at), own, leaves, _FINENESS)
-            for away in (3.0, 9.0, 16.0):
+            for away in (1.8, 3.0, 9.0, 16.0):
                 for s in _row(edge, scape.shrub_gap, rng):
                     foot, _, outward = _beside(edge, s, side)
-                    at = foot + (half + away + rng.uniform(-1.5, 4.0)) * outward
-                    if self._land.claim(at, 0.8, 0.8, 0.0, 2.2):
+                    at = foot + (half + away + rng.uniform(-0.8, 3.0)) * outward
+                    if self._land.claim(at, 0.8, 0.8, 0.0, 1.0):
                         shapes.shrub(mesh, self._on_ground(at), rng)
             for s in _row(edge, scape.hedge_gap, rng):
                 length = float(rng.uniform(3.0, 12.0))
