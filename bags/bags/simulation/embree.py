@@ -8,12 +8,7 @@ from numpy.typing import NDArray
 
 from bags.simulation.hits import Hits
 from bags.simulation.scene import Scene
-from bags.street.mesh import Label
-
-_MOVING = {Label.CAR: Label.MOVING_CAR, Label.PERSON: Label.MOVING_PERSON}
-_LABEL_OF_MOVER = np.arange(256, dtype=np.uint8)
-for _still, _moving in _MOVING.items():
-    _LABEL_OF_MOVER[_still] = _moving
+from bags.street.mesh import MOVING
 
 
 @dataclass(frozen=True)
@@ -79,7 +74,7 @@ class EmbreeCaster:
             at = moving[found.mover[moving] == index]
             other, own = self.scene.movers[index].mesh, found.triangle[at]
             material[at] = other.materials[own]
-            label[at] = _LABEL_OF_MOVER[other.labels[own]]
+            label[at] = MOVING[other.labels[own]]
         incidence = np.abs(np.einsum('ij,ij->i', found.normal, directions))
         return Hits(
             found.range_m, incidence.astype(np.float32), triangle, material, label, found.mover

@@ -16,14 +16,13 @@ from bags.simulation.lidar_measurement import (
     neighbours,
 )
 from bags.simulation.lidar_model import LidarModel
-from bags.simulation.reflectivity import REFLECTIVITY
+from bags.simulation.reflectivity import REFLECTIVITY, patchiness
 from bags.street.mesh import RETURN_SHARE
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 
 # Casts of one moving sweep: how often the other road users are placed anew.
 _PARTS = 6
-_PATCH_M = 2.0
 
 
 class Caster(Protocol):
@@ -147,13 +146,3 @@ class LidarSensor:
         xyz = (range_m * self._directions) @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
         base = REFLECTIVITY[hits.label, hits.material].reshape(self._shape)
         return np.clip(base * patchiness(xyz), 0.02, 1.0)
-
-
-def patchiness(xyz: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return factors 0.7..1.3 [...] on the reflectivity at world points [... x 3], by 2 m cells."""
-    cell = np.floor(xyz / _PATCH_M).astype(np.int32)
-    mixed = cell[..., 0] * np.int32(73856093)
-    mixed ^= cell[..., 1] * np.int32(19349663)
-    mixed ^= cell[..., 2] * np.int32(83492791)
-    mixed ^= mixed >> 13
-    return 0.7 + 0.6 * ((mixed & 0xFFFF).astype(np.float32) / 65535.0)

@@ -12,7 +12,7 @@ import torch
 
 from bags.simulation.lidar_model import LidarModel
 from bags.simulation.scene import Scene
-from bags.street.mesh import MOVING, Label
+from bags.street.mesh import MOVING
 from lcd_common.errors import ConfigError
 
 _TWO_PI = 2.0 * np.pi
@@ -128,7 +128,7 @@ class LidarRaster:
             placed = (mover.mesh.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
             corners.append(placed[mover.mesh.triangles])
             materials.append(mover.mesh.materials.astype(np.int64))
-            labels.append([MOVING.get(Label(i), i) for i in mover.mesh.labels])
+            labels.append(MOVING[mover.mesh.labels])
         if not corners:
             return None
         return (

@@ -12,7 +12,7 @@ import torch
 from bags.simulation.lidar_measurement import Draws, Surfaces, beam_errors, measure, neighbours
 from bags.simulation.lidar_model import lidar_model
 from bags.simulation.raster import LidarRaster
-from bags.simulation.reflectivity import REFLECTIVITY
+from bags.simulation.reflectivity import REFLECTIVITY, patchiness
 from bags.simulation.street_map import StreetEdge
 from bags.simulation.town import SimulatedTown
 from bags.street.mesh import RETURN_SHARE
@@ -20,7 +20,6 @@ from lcd_common import se3
 from lcd_common.errors import ConfigError
 
 TRAIN_SEEDS, VALIDATION_SEEDS, TEST_SEEDS = range(100), range(100, 110), range(200, 210)
-_PATCH_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class SweepStream:
             s = float(self._rng.uniform(0.0, edge.length_m))
             sensor = str(self._rng.choice(self.settings.sensors))
             T_first = T_second = self._pose(held.town, edge, s)
-            while T_second is T_first or _apart_m(T_first, T_second) > max_distance_m:
+            while T_second is T_first or se3.distance(T_first, T_second)[0] > max_distance_m:
                 near = s + float(self._rng.uniform(-max_distance_m, max_distance_m))
                 T_second = self._pose(held.town, edge, near, any_heading=any_heading)
             yield self._sweep(held, T_first, sensor), self._sweep(held, T_second, sensor)
@@ -165,11 +164,7 @@ class SweepStream:
         reverse = any_heading and rng.random() < 0.5
         lane = min(float(rng.uniform(*settings.lane_m)), 0.5 * edge.half_width_m)
         s = float(np.clip(s, 0.0, edge.length_m))
-        line = edge.centreline
-        at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-        k = int(np.clip(np.searchsorted(at, s) - 1, 0, len(line) - 2))
-        direction = (line[k + 1] - line[k]) / (at[k + 1] - at[k])
-        xy = line[k] + (s - at[k]) * direction
+        xy, direction = edge.at(s)
         heading = np.arctan2(direction[1], direction[0]) + (np.pi if reverse else 0.0)
         xy = xy + lane * np.array([np.sin(heading), -np.cos(heading)])
         height = float(town.ground.height(xy[None])[0]) + float(rng.uniform(*settings.height_m))
@@ -178,10 +173,6 @@ class SweepStream:
         T = T @ se3.exp(np.array([0.0, 0.0, 0.0, roll, pitch, 0.0]))
         T[:3, 3] = *xy, height
         return np.asarray(T)
-
-
-def _apart_m(T_a: se3.Array, T_b: se3.Array) -> float:
-    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]))
 
 
 def measured_sweep(
@@ -204,7 +195,7 @@ def measured_sweep(
     surfaces = Surfaces(
         hits.range_m,
         hits.incidence,
-        (reflectivity * patchiness(xyz_world)).clamp(0.02, 1.0),
+        (reflectivity * patchiness(xyz_world, torch)).clamp(0.02, 1.0),
         torch.as_tensor(RETURN_SHARE, **to_device)[hits.material],  # type: ignore[call-overload]
     )
     near = neighbours(model, rng.random(shape, np.float32))
@@ -219,12 +210,3 @@ def measured_sweep(
     returned &= torch.as_tensor(model.open_columns(), device=device)[:, None]
     xyz = raster.directions[returned] * echoes.range_m[returned][:, None]
     return xyz, echoes.intensity[returned]
-
-
-def patchiness(xyz: torch.Tensor) -> torch.Tensor:
-    """Return bags.simulation.lidar.patchiness of world points [... x 3]."""
-    cell = torch.floor(xyz / _PATCH_M).to(torch.int32)
-    mixed = cell[..., 0] * 73856093
-    mixed = mixed ^ (cell[..., 1] * 19349663) ^ (cell[..., 2] * 83492791)
-    mixed = mixed ^ (mixed >> 13)
-    return 0.7 + 0.6 * ((mixed & 0xFFFF).to(torch.float32) / 65535.0)

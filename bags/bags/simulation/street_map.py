@@ -1,6 +1,7 @@
 """Lay out the streets of a town: crossings, curves, dead ends and districts."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -34,7 +35,22 @@ class StreetEdge:
     @property
     def length_m(self) -> float:
         """Length along the centreline."""
-        return float(np.linalg.norm(np.diff(self.centreline, axis=0), axis=1).sum())
+        return float(self._steps_m.sum())
+
+    @cached_property
+    def _steps_m(self) -> se3.Array:
+        return np.asarray(np.linalg.norm(np.diff(self.centreline, axis=0), axis=1))
+
+    @cached_property
+    def _travelled_m(self) -> se3.Array:
+        return np.concatenate([[0.0], np.cumsum(self._steps_m)])
+
+    def at(self, s: float) -> tuple[se3.Array, se3.Array]:
+        """Return the centreline's point [2] at `s` metres and the unit vector [2] along it."""
+        line, travelled = self.centreline, self._travelled_m
+        k = int(np.clip(np.searchsorted(travelled, s) - 1, 0, len(line) - 2))
+        along = (line[k + 1] - line[k]) / self._steps_m[k]
+        return line[k] + (s - travelled[k]) * along, along
 
 
 @dataclass(frozen=True)

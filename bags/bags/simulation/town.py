@@ -214,12 +214,8 @@ class SimulatedTown:
 
 def _beside(edge: StreetEdge, s: float, side: float) -> tuple[se3.Array, se3.Array, se3.Array]:
     """Return the centreline's point at `s` metres, and unit vectors along and away from it."""
-    line = edge.centreline
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    at = np.concatenate([[0.0], np.cumsum(steps)])
-    k = int(np.clip(np.searchsorted(at, s) - 1, 0, len(steps) - 1))
-    along = (line[k + 1] - line[k]) / steps[k]
-    return line[k] + (s - at[k]) * along, along, side * np.array([-along[1], along[0]])
+    point, along = edge.at(s)
+    return point, along, side * np.array([-along[1], along[0]])
 
 
 def _row(

@@ -45,8 +45,9 @@ class Label(IntEnum):
     MOVING_PERSON = 254
 
 
-# What a thing that moves on its own is called instead.
-MOVING = {Label.CAR: Label.MOVING_CAR, Label.PERSON: Label.MOVING_PERSON}
+# MOVING[label]: what a thing is called that moves on its own.
+MOVING = np.arange(256, dtype=np.uint8)
+MOVING[[Label.CAR, Label.PERSON]] = Label.MOVING_CAR, Label.MOVING_PERSON
 # Share of near-infrared light sent back, in the order of Material: plausible, not measured.
 REFLECTIVITY = np.array([0.15, 0.40, 0.60, 0.35, 0.10, 0.70, 0.45, 0.25, 0.50])
 # Share of the rays that come back at all; glass is mostly looked through.

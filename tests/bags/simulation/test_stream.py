@@ -9,14 +9,13 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from bags.simulation.lidar import patchiness as patchiness_numpy
+from bags.simulation.reflectivity import patchiness
 from bags.simulation.stream import (
     TEST_SEEDS,
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
     StreamConfig,
     SweepStream,
-    patchiness,
 )
 from lcd_common.errors import ConfigError
 
@@ -69,7 +68,7 @@ def test_blocked_sectors_hold_no_points() -> None:
 
 def test_patches_are_those_of_the_numpy_sensor() -> None:
     xyz = np.random.default_rng(0).uniform(-300.0, 300.0, (5000, 3)).astype(np.float32)
-    np.testing.assert_allclose(patchiness(torch.as_tensor(xyz)).numpy(), patchiness_numpy(xyz))
+    np.testing.assert_allclose(patchiness(torch.as_tensor(xyz), torch).numpy(), patchiness(xyz))
 
 
 def test_mistakes_are_told() -> None:
