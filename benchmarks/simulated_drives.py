@@ -13,11 +13,13 @@ from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.stream import TEST_SEEDS
 from bags.simulation.town import SimulatedTown
 from lcd_common import se3
+from lcd_common.cloud import PointCloud
 from lcd_loop_closure.report.detection_protocols import PrecisionRecall, candidates, protocol_1
 from lcd_loop_closure.revisits import count_revisits
 from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 
 _HEIGHT_M = 1.73
+_MEAN_SPEED_M_S = 6.3  # of the simulated journeys, stops included
 _SPACING_M = 1.0  # KITTI's cars take a scan a metre
 # One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
 _JOURNEYS = {
@@ -58,7 +60,7 @@ def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, dict[str, float]]:
     rows = []
     for index in kept:
         xyz = drive.sweep(index).cloud.xyz + np.array([0.0, 0.0, _HEIGHT_M], np.float32)
-        rows.append(descriptor.row(descriptor.describe(xyz)))
+        rows.append(descriptor.row(descriptor.describe(PointCloud(xyz))))
     table = np.array(rows)
     found = candidates(lambda i, m: descriptor.compare(table[i], table[:m])[0], poses[:, :3, 3])
     within, nearest_other, between = [], [], []
@@ -126,8 +128,8 @@ def live(work: Path, seconds: float = 600.0) -> dict[str, Any]:
     if not bag.is_dir():
         bags = str(Path(sys.executable).parent / 'bags')
         subprocess.run(
-            [bags, 'convert', f'town:{TEST_SEEDS[0]}', '--out', str(bag), '--points-only',
-             '--duration', str(seconds)],
+            [bags, 'simulate', '--town', str(TEST_SEEDS[0]), '--out', str(bag),
+             '--length', f'{_MEAN_SPEED_M_S * seconds:.0f}'],
             check=True,
         )  # fmt: skip
     result = run_live(bag, {'lidar_odometry': ['min_range:=2.0']}, work / 'town_live_log')
@@ -137,6 +139,7 @@ def live(work: Path, seconds: float = 600.0) -> dict[str, Any]:
     return {
         'live_10hz': {
             'scans': len(sent),
+            'seconds': 0.1 * len(sent),
             'odometry_lost': len(sent) - len(recorder.odometry_published_ns),
             'odometry_latency_p50_ms': float(np.percentile(latencies, 50)),
             'odometry_latency_p99_ms': float(np.percentile(latencies, 99)),

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 
 
@@ -24,6 +25,22 @@ class Metric(Protocol):
         self, query: NDArray[np.float32], rows: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Return distances [N] and, where the metric knows it, the query's yaw in each match."""
+
+
+class PlaceDescriptor(Metric, Protocol):
+    """How sweeps are described and compared.
+
+    `name` is what users call it; `length` counts the numbers of a descriptor.
+    """
+
+    name: str
+
+    @property
+    def length(self) -> int:
+        """Numbers in a descriptor."""
+
+    def describe(self, cloud: PointCloud) -> NDArray[np.float32]:
+        """Return the descriptor [length] float32 of a sweep in the base frame."""
 
 
 class Euclidean:

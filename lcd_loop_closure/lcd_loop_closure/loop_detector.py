@@ -164,7 +164,7 @@ class LoopDetector:
     def describe(self, cloud: PointCloud) -> NDArray[np.float32]:
         """Return the descriptor of a whole sweep (base frame); flattened float32."""
         with self._timer('describe'):
-            return self._descriptor.describe(cloud.xyz)
+            return self._descriptor.describe(cloud)
 
     def restore(self, keyframes: Iterable[Keyframe]) -> None:
         """Remember keyframes of a loaded map; all of them are candidates at once.

@@ -74,7 +74,7 @@ class LoopSearch:
         if not len(reduced):
             return None
         with self._timer('describe'):
-            descriptor = self._descriptor.describe(cloud.xyz)
+            descriptor = self._descriptor.describe(cloud)
         return session.builder.build(pose, reduced, descriptor, ScanContext.name)
 
     def run(self, job: SearchJob) -> list[LoopConstraint]:

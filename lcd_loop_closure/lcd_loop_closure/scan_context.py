@@ -8,6 +8,7 @@ paper's.
 import numpy as np
 from numpy.typing import NDArray
 
+from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 from lcd_common.settings import config, setting
 
@@ -53,13 +54,13 @@ class ScanContext:
         s = self.settings
         return s.rings + 2 * (s.sectors // 2 + 1) * (s.rings + 1)
 
-    def describe(self, xyz: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the descriptor [rings * sectors] float32 of points [N x 3], base frame, metres.
+    def describe(self, cloud: PointCloud) -> NDArray[np.float32]:
+        """Return the descriptor [rings * sectors] float32 of a sweep in the base frame.
 
         Each bin holds the largest height of its points above `-height_offset` (eq. 1 to 3), zero
         where it has none.
         """
-        s = self.settings
+        s, xyz = self.settings, cloud.xyz
         bins = np.zeros(self.length, np.float32)
         distance = np.hypot(xyz[:, 0], xyz[:, 1])
         with np.errstate(invalid='ignore'):

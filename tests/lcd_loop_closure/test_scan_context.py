@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 
@@ -42,7 +43,7 @@ def turned(xyz, yaw):
 def test_bins_hold_the_largest_height():
     xyz = np.array([[10.0, 0.1, 1.0], [10.1, 0.2, 3.0], [-50.0, -1.0, 2.0], [200.0, 0.0, 9.0]])
     scan_context = ScanContext(ScanContextConfig(height_offset=0.5))
-    context = scan_context.describe(xyz).reshape(20, 60)
+    context = scan_context.describe(PointCloud(xyz)).reshape(20, 60)
     assert context[2, 0] == pytest.approx(3.5)
     assert context[12, 30] == pytest.approx(2.5)
     assert np.count_nonzero(context) == 2
@@ -50,7 +51,7 @@ def test_bins_hold_the_largest_height():
 
 def test_a_point_without_coordinates_is_left_out():
     xyz = np.array([[10.0, 0.1, 1.0], [np.nan, 0.1, 5.0], [10.0, 0.1, np.inf]])
-    assert ScanContext().describe(xyz).max() == pytest.approx(1.27)
+    assert ScanContext().describe(PointCloud(xyz)).max() == pytest.approx(1.27)
 
 
 def test_distances_and_yaws_are_those_of_the_formula(rng):
@@ -72,9 +73,9 @@ def test_a_turn_by_whole_sectors_is_found_exactly(rng, sectors_turned):
     # The query's vehicle is turned by yaw, so its points turn the other way.
     query = turned(match, -yaw)
     scan_context = ScanContext()
-    row = scan_context.row(scan_context.describe(match))
+    row = scan_context.row(scan_context.describe(PointCloud(match)))
     distance, found = scan_context.compare(
-        scan_context.row(scan_context.describe(query)), row[None]
+        scan_context.row(scan_context.describe(PointCloud(query))), row[None]
     )
     assert distance[0] == pytest.approx(0.0, abs=1e-5)
     assert np.cos(found[0] - yaw) == pytest.approx(1.0, abs=1e-6)

@@ -1,14 +1,17 @@
 """Stream simulated sweeps into training, on any device, without files.
 
-Towns are built by numpy and cast by torch: neither Open3D nor ROS is needed.
+Towns are built by numpy and cast by Embree or torch: neither Open3D nor ROS is needed.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 
 import numpy as np
 import torch
 
+from bags.simulation.embree import EmbreeCaster
+from bags.simulation.lidar import LidarSensor
 from bags.simulation.lidar_measurement import Draws, Surfaces, beam_errors, measure, neighbours
 from bags.simulation.lidar_model import lidar_model
 from bags.simulation.raster import LidarRaster
@@ -19,6 +22,7 @@ from bags.street.mesh import RETURN_SHARE
 from lcd_common import se3
 from lcd_common.errors import ConfigError
 
+_TRIES = 50
 TRAIN_SEEDS, VALIDATION_SEEDS, TEST_SEEDS = range(100), range(100, 110), range(200, 210)
 
 
@@ -35,6 +39,8 @@ class StreamConfig:
         tilt_rad: standard deviation of roll and pitch.
         lane_m: (least, most) distance right of the centreline.
         blocked_deg: widths of random sectors that may be blocked; 0 leaves the sweep whole.
+        caster: 'embree' (Open3D, the CPU), 'torch' (any device), or 'auto': Embree for a CPU where
+            Open3D is installed.
     """
 
     sensors: tuple[str, ...] = ('hdl64',)
@@ -45,6 +51,7 @@ class StreamConfig:
     tilt_rad: float = 0.01
     lane_m: tuple[float, float] = (0.5, 3.0)
     blocked_deg: tuple[float, ...] = (0.0,)
+    caster: str = 'auto'
 
 
 @dataclass(frozen=True)
@@ -55,12 +62,14 @@ class StreamedSweep:
         xyz: [N x 3] float32 on the stream's device, lidar frame, metres.
         intensity: [N] 0..1.
         T_world_lidar: [4 x 4] float64.
+        height_m: of the sensor above the road.
         town, run, sensor: where from.
     """
 
     xyz: torch.Tensor
     intensity: torch.Tensor
     T_world_lidar: se3.Array
+    height_m: float
     town: int
     run: int
     sensor: str
@@ -69,7 +78,7 @@ class StreamedSweep:
 @dataclass
 class _HeldTown:
     town: SimulatedTown
-    rasters: dict[int, LidarRaster] = field(default_factory=dict)
+    casters: dict[int, EmbreeCaster | LidarRaster] = field(default_factory=dict)
     sweeps: int = 0
 
 
@@ -95,11 +104,12 @@ class SweepStream:
             styles: of the towns, drawn at random.
 
         Raises:
-            ConfigError: there is no sensor of a name, or no town.
+            ConfigError: there is no sensor or caster of a name, or no town.
         """
         self.settings = settings or StreamConfig()
         if not seeds:
             raise ConfigError('a stream needs the seed of at least one town')
+        self._embree = _use_embree(self.settings.caster, torch.device(device))
         self.models = {name: lidar_model(name) for name in self.settings.sensors}
         self.device = torch.device(device)
         self._seeds, self._styles = list(seeds), list(styles)
@@ -109,16 +119,37 @@ class SweepStream:
     def pairs(
         self, max_distance_m: float = 4.0, any_heading: bool = True
     ) -> Iterator[tuple[StreamedSweep, StreamedSweep]]:
-        """Yield sweeps of one place, of two runs, at most so far apart, without end."""
+        """Yield two sweeps of one place, at most so far apart, without end."""
+        for first, second in self.places([(0.0, max_distance_m)], any_heading):
+            yield first, second
+
+    def places(
+        self, apart_m: Sequence[tuple[float, float]], any_heading: bool = True
+    ) -> Iterator[tuple[StreamedSweep, ...]]:
+        """Yield sweeps of one place without end, each of a run drawn at random.
+
+        Args:
+            apart_m: (least, most) distance from the first sweep, for each of the others.
+            any_heading: draw the directions of travel; else all of a place go the same way.
+        """
         while True:
             held, edge = self._place()
             s = float(self._rng.uniform(0.0, edge.length_m))
             sensor = str(self._rng.choice(self.settings.sensors))
-            T_first = T_second = self._pose(held.town, edge, s)
-            while T_second is T_first or se3.distance(T_first, T_second)[0] > max_distance_m:
-                near = s + float(self._rng.uniform(-max_distance_m, max_distance_m))
-                T_second = self._pose(held.town, edge, near, any_heading=any_heading)
-            yield self._sweep(held, T_first, sensor), self._sweep(held, T_second, sensor)
+            reverse = bool(self._rng.random() < 0.5)
+            poses = [self._pose(held.town, edge, s, reverse)]
+            for least, most in apart_m:
+                for _ in range(_TRIES):
+                    if any_heading:
+                        reverse = bool(self._rng.random() < 0.5)
+                    near = s + float(self._rng.uniform(-most, most))
+                    T = self._pose(held.town, edge, near, reverse)
+                    if least <= se3.distance(poses[0][0], T[0])[0] <= most:
+                        poses.append(T)
+                        break
+            # A short street may have no pose as far away as was asked.
+            if len(poses) == 1 + len(apart_m):
+                yield tuple(self._sweep(held, T, sensor) for T in poses)
 
     def sweeps(self) -> Iterator[StreamedSweep]:
         """Yield sweeps of random places without end."""
@@ -126,7 +157,8 @@ class SweepStream:
             held, edge = self._place()
             s = float(self._rng.uniform(0.0, edge.length_m))
             sensor = str(self._rng.choice(self.settings.sensors))
-            yield self._sweep(held, self._pose(held.town, edge, s), sensor)
+            reverse = bool(self._rng.random() < 0.5)
+            yield self._sweep(held, self._pose(held.town, edge, s, reverse), sensor)
 
     def _place(self) -> tuple[_HeldTown, StreetEdge]:
         """Draw a town that is held, and a street of it."""
@@ -141,38 +173,56 @@ class SweepStream:
         chosen = int(rng.choice(len(lengths), p=lengths / lengths.sum()))
         return held, held.town.streets.edges[chosen]
 
-    def _sweep(self, held: _HeldTown, T: se3.Array, sensor: str) -> StreamedSweep:
+    def _sweep(self, held: _HeldTown, pose: tuple[se3.Array, float], sensor: str) -> StreamedSweep:
         rng, run = self._rng, int(self._rng.integers(self.settings.runs))
-        if run not in held.rasters:
-            held.rasters[run] = LidarRaster(held.town.scene(run), self.models[sensor], self.device)
+        T, height_m = pose
         held.sweeps += 1
         model = self.models[sensor]
         width = float(rng.choice(self.settings.blocked_deg))
         if width:
             begin = float(rng.uniform(0.0, 360.0))
             model = model.blocked(*model.blocked_deg, (begin, begin + width))
-        raster = held.rasters[run]
-        raster.look_with(model)
-        xyz, intensity = measured_sweep(raster, T, float(rng.uniform(0.0, 600.0)), rng)
-        return StreamedSweep(xyz, intensity, T, held.town.seed, run, sensor)
+        time_s = float(rng.uniform(0.0, 600.0))
+        if run not in held.casters:
+            scene = held.town.scene(run)
+            held.casters[run] = (
+                EmbreeCaster(scene) if self._embree else LidarRaster(scene, model, self.device)
+            )
+        caster = held.casters[run]
+        if isinstance(caster, LidarRaster):
+            caster.look_with(model)
+            xyz, intensity = measured_sweep(caster, T, time_s, rng)
+        else:
+            cloud = LidarSensor(model, caster, int(rng.integers(8))).sweep(T, time_s, rng).cloud
+            xyz = torch.from_numpy(cloud.xyz)
+            values = np.zeros(len(cloud), np.float32) if cloud.intensity is None else cloud.intensity
+            intensity = torch.from_numpy(values.astype(np.float32))
+        return StreamedSweep(xyz, intensity, T, height_m, held.town.seed, run, sensor)
 
     def _pose(
-        self, town: SimulatedTown, edge: StreetEdge, s: float, any_heading: bool = True
-    ) -> se3.Array:
-        """Draw T_world_lidar in one of the lanes, `s` metres along a street."""
+        self, town: SimulatedTown, edge: StreetEdge, s: float, reverse: bool
+    ) -> tuple[se3.Array, float]:
+        """Draw T_world_lidar in a lane `s` metres along a street, and the sensor's height."""
         rng, settings = self._rng, self.settings
-        reverse = any_heading and rng.random() < 0.5
         lane = min(float(rng.uniform(*settings.lane_m)), 0.5 * edge.half_width_m)
         s = float(np.clip(s, 0.0, edge.length_m))
         xy, direction = edge.at(s)
         heading = np.arctan2(direction[1], direction[0]) + (np.pi if reverse else 0.0)
         xy = xy + lane * np.array([np.sin(heading), -np.cos(heading)])
-        height = float(town.ground.height(xy[None])[0]) + float(rng.uniform(*settings.height_m))
+        height_m = float(rng.uniform(*settings.height_m))
         roll, pitch = rng.normal(0.0, settings.tilt_rad, 2)
         T = se3.rotation_z(float(heading + rng.normal(0.0, 0.03)))
         T = T @ se3.exp(np.array([0.0, 0.0, 0.0, roll, pitch, 0.0]))
-        T[:3, 3] = *xy, height
-        return np.asarray(T)
+        T[:3, 3] = *xy, float(town.ground.height(xy[None])[0]) + height_m
+        return np.asarray(T), height_m
+
+
+def _use_embree(caster: str, device: torch.device) -> bool:
+    if caster not in ('auto', 'embree', 'torch'):
+        raise ConfigError(f'the caster is auto, embree or torch, got {caster!r}')
+    if caster != 'auto':
+        return caster == 'embree'
+    return device.type == 'cpu' and find_spec('open3d') is not None
 
 
 def measured_sweep(

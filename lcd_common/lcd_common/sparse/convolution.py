@@ -18,12 +18,16 @@ def convolve(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> Tensor:
 
     One sum over all taps at the end is two to six times as fast as one for each.
     """
-    gathered = features[kernel_map.source]
+    # index_select: its gradient is one sum, that of an index by brackets is slow
+    gathered = features.index_select(0, kernel_map.source)
     parts = [
         part @ weight[tap] for tap, part in enumerate(gathered.split(kernel_map.pairs)) if len(part)
     ]
-    out = gathered.new_zeros((len(kernel_map.keys), weight.shape[2]))
-    return out.index_add(0, kernel_map.target, torch.cat(parts)) if parts else out
+    if not parts:
+        return gathered.new_zeros((len(kernel_map.keys), weight.shape[2]))
+    every = torch.cat(parts)  # in the precision that autocast chose
+    out = every.new_zeros((len(kernel_map.keys), weight.shape[2]))
+    return out.index_add(0, kernel_map.target, every)
 
 
 class _Convolution(nn.Module):

@@ -91,10 +91,13 @@ def strided_map(
     device = tensor.keys.device
     steps = torch.tensor(list(stride), device=device)
     offset = taps(kernel).to(device) - torch.tensor(list(padding), device=device)
-    position = tensor.coordinates[None, :, 1:] - offset[:, None]  # [K x N x 3], q * stride
-    fits = (position % steps == 0).all(2)
+    # p - offset is a multiple of the stride when both leave the same remainders.
+    place = torch.tensor([stride[1] * stride[2], stride[2], 1], device=device)
+    left_over = ((tensor.coordinates[:, 1:] % steps) * place).sum(1)
+    fits = left_over == ((offset % steps) * place).sum(1)[:, None]
     tap, source = torch.nonzero(fits, as_tuple=True)
-    q = torch.div(position[tap, source], steps, rounding_mode='floor')
+    position = tensor.coordinates[source, 1:] - offset[tap]  # q * stride
+    q = torch.div(position, steps, rounding_mode='floor')
     reached = pack(torch.cat([tensor.coordinates[source, :1], q], 1))
     if covered:
         keys, target = torch.unique(reached, return_inverse=True)

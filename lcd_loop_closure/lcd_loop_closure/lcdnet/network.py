@@ -1,0 +1,107 @@
+"""The whole network: clouds in, keypoint features and descriptors out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lcd_loop_closure.lcdnet.config import LcdnetConfig
+from lcd_loop_closure.lcdnet.keypoints import above_ground, farthest_points
+from lcd_loop_closure.lcdnet.netvlad import NetVlad
+from lcd_loop_closure.lcdnet.pyramid import VoxelPyramid
+from lcd_loop_closure.lcdnet.set_abstraction import VoxelSetAbstraction
+from lcd_loop_closure.lcdnet.transport import SoftMatches, TransportHead
+from lcd_loop_closure.lcdnet.voxels import Clouds, Voxels, see
+from lcd_loop_closure.lcdnet.weighted_svd import weighted_svd
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the network says of a batch of clouds.
+
+    Attributes:
+        keypoints: [B x N x 3] float32, base frame, metres.
+        features: [B x N x D].
+        descriptors: [B x G], unit length.
+        left_out: voxels beyond the cap, over all clouds.
+    """
+
+    keypoints: Tensor
+    features: Tensor
+    descriptors: Tensor
+    left_out: int
+
+
+class Lcdnet(nn.Module):
+    """Describe clouds and match them (thesis Figure 3.2)."""
+
+    def __init__(self, settings: LcdnetConfig) -> None:
+        super().__init__()
+        s = self.settings = settings.check()
+        self.pyramid = VoxelPyramid(s)
+        self.abstraction = VoxelSetAbstraction(s, self.pyramid.bev_size)
+        self.place = NetVlad(s.feature_size, s.clusters, s.descriptor_size)
+        self.transport = TransportHead(s.sinkhorn_iterations)
+
+    def forward(
+        self,
+        clouds: Clouds,
+        *,
+        keypoints: int | None = None,
+        generator: np.random.Generator | None = None,
+    ) -> Features:
+        """Return keypoints, features and descriptors.
+
+        Args:
+            clouds: the batch.
+            keypoints: how many for each cloud; None: as configured.
+            generator: of random choices while training (first keypoint, neighbours); None: none.
+        """
+        number = keypoints or self.settings.keypoints
+        voxels = see(clouds, self.settings)
+        pyramid = self.pyramid(voxels, clouds.size)
+        chosen = self._keypoints(clouds, voxels, number, generator)
+        batch = torch.arange(clouds.size, device=chosen.device).repeat_interleave(number)
+        features = self.abstraction(clouds, voxels, pyramid, chosen, batch, generator)
+        features = features.view(clouds.size, number, -1)
+        return Features(
+            chosen.view(clouds.size, number, 3), features, self.place(features), voxels.left_out
+        )
+
+    def match(self, features: Features, source: Tensor, target: Tensor) -> SoftMatches:
+        """Match clouds `source` [P] of a batch softly to clouds `target` [P]."""
+        return self.transport(
+            features.features[source], features.features[target], features.keypoints[target]
+        )
+
+    def relative_pose(self, features: Features, source: Tensor, target: Tensor) -> Tensor:
+        """Return T_target_source [P x 4 x 4] of pairs in a batch, by transport alone ("fast")."""
+        matches = self.match(features, source, target)
+        return weighted_svd(features.keypoints[source].float(), matches.projected, matches.weight)
+
+    def _keypoints(
+        self,
+        clouds: Clouds,
+        voxels: Voxels,
+        number: int,
+        generator: np.random.Generator | None,
+    ) -> Tensor:
+        """Choose keypoints [B N x 3]: of the points, or of the finest voxels where those are coarse."""
+        s, chosen = self.settings, []
+        of_points = not s.relative_input
+        xyz = clouds.xyz if of_points else voxels.xyz
+        batch = clouds.batch if of_points else voxels.tensor.coordinates[:, 0]
+        for cloud in range(clouds.size):
+            own = xyz[batch == cloud]
+            if of_points:
+                own = own[(own[:, :2].abs() < s.reach).all(1)]
+            if s.keypoint_height > 0.0:
+                structure = own[above_ground(own, s.keypoint_height)]
+                # An open field has no structure: rather the ground than nothing.
+                own = structure if len(structure) >= number // 4 else own
+            if not len(own):
+                own = xyz.new_zeros((1, 3))
+            first = 0 if generator is None else int(generator.integers(len(own)))
+            chosen.append(own[farthest_points(own, number, first)])
+        return torch.cat(chosen)
