@@ -14,7 +14,7 @@ from bags.simulation.stream import TEST_SEEDS
 from bags.simulation.town import SimulatedTown
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_loop_closure.report.detection_protocols import PrecisionRecall, candidates, protocol_1
+from lcd_loop_closure.evaluation.detection_protocols import PrecisionRecall, candidates, protocol_1
 from lcd_loop_closure.revisits import count_revisits
 from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 

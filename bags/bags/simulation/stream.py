@@ -120,8 +120,8 @@ class SweepStream:
         self, max_distance_m: float = 4.0, any_heading: bool = True
     ) -> Iterator[tuple[StreamedSweep, StreamedSweep]]:
         """Yield two sweeps of one place, at most so far apart, without end."""
-        for first, second in self.places([(0.0, max_distance_m)], any_heading):
-            yield first, second
+        for sweeps in self.places([(0.0, max_distance_m)], any_heading):
+            yield sweeps[0], sweeps[1]
 
     def places(
         self, apart_m: Sequence[tuple[float, float]], any_heading: bool = True
@@ -195,7 +195,9 @@ class SweepStream:
         else:
             cloud = LidarSensor(model, caster, int(rng.integers(8))).sweep(T, time_s, rng).cloud
             xyz = torch.from_numpy(cloud.xyz)
-            values = np.zeros(len(cloud), np.float32) if cloud.intensity is None else cloud.intensity
+            values = (
+                np.zeros(len(cloud), np.float32) if cloud.intensity is None else cloud.intensity
+            )
             intensity = torch.from_numpy(values.astype(np.float32))
         return StreamedSweep(xyz, intensity, T, height_m, held.town.seed, run, sensor)
 

@@ -19,9 +19,7 @@ class AugmentationConfig:
     tilt: float = setting(3.0, 'largest roll and pitch', unit='deg', low=0.0)
     shift: float = setting(1.5, 'largest shift along x and y', unit='m', low=0.0)
     lift: float = setting(0.25, 'largest shift along z', unit='m', low=0.0)
-    blocked_share: float = setting(
-        0.3, 'share of sweeps with a blocked sector', low=0.0, high=1.0
-    )
+    blocked_share: float = setting(0.3, 'share of sweeps with a blocked sector', low=0.0, high=1.0)
     blocked_most: float = setting(120.0, 'widest blocked sector', unit='deg', low=0.0, high=360.0)
     thinned_share: float = setting(
         0.5, 'share of sweeps that lose points at random', low=0.0, high=1.0

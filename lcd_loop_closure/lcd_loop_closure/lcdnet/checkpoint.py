@@ -36,8 +36,9 @@ def read(path: Path, device: torch.device | str = 'cpu') -> Stored:
     """Read a file of weights; raises DataError when it is none."""
     try:
         with safe_open(path, 'pt', device=str(device)) as file:
+            names = list(file.keys())
             facts = json.loads((file.metadata() or {})['facts'])
-            return Stored({name: file.get_tensor(name) for name in file.keys()}, facts)
+            return Stored({name: file.get_tensor(name) for name in names}, facts)
     except FileNotFoundError:
         raise
     except Exception as error:
@@ -64,8 +65,9 @@ def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Lcdnet
     """
     stored = read(path, device)
     try:
+        given: dict[str, Any] = stored.facts['config']
         settings = LcdnetConfig(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in stored.facts['config'].items()}
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
         )
         network = Lcdnet(settings)
         network.load_state_dict(

@@ -64,9 +64,13 @@ class LcdnetConfig:
 
     def check(self) -> 'LcdnetConfig':
         """Return this configuration; raises ConfigError when its tables do not fit together."""
-        rows = {len(getattr(self, f'group_{name}')) for name in ('source', 'radius', 'count', 'width')}
+        rows = {
+            len(getattr(self, f'group_{name}')) for name in ('source', 'radius', 'count', 'width')
+        }
         if len(rows) != 1:
-            raise ConfigError('group_source, group_radius, group_count and group_width need one row each')
+            raise ConfigError(
+                'group_source, group_radius, group_count and group_width need one row each'
+            )
         if len(self.channels) != 4 or len(self.blocks) != 4:
             raise ConfigError('channels and blocks need four numbers, one for each level')
         if any(not 0 <= source <= 4 for source in self.group_source):

@@ -53,7 +53,7 @@ class FeatureRegistration:
     def matches(
         self, query: NDArray[np.float32], match: NDArray[np.float32]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-        """Return rows of the query [K] and the match [K] with like features [N x D], and cosines."""
+        """Return rows of the query [K] and the match [K] with like features, and cosines [K]."""
         cosine = _unit(query) @ _unit(match).T
         k = min(self.settings.neighbours, cosine.shape[0], cosine.shape[1])
         best = np.argpartition(-cosine, k - 1, axis=1)[:, :k]
@@ -207,9 +207,7 @@ def _polished(
     return T, int(np.count_nonzero(_squared(T, p, q) < bound_m**2))
 
 
-def _squared(
-    T: se3.Array, p: NDArray[np.float64], q: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _squared(T: se3.Array, p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sum((p @ T[:3, :3].T + T[:3, 3] - q) ** 2, axis=1))
 
 

@@ -71,11 +71,17 @@ def _spread(found: Tensor, count: int, generator: np.random.Generator | None) ->
 
 
 def _by_tree(
-    points: Tensor, centres: Tensor, radius_m: float, count: int, in_points: Tensor, in_centres: Tensor
+    points: Tensor,
+    centres: Tensor,
+    radius_m: float,
+    count: int,
+    in_points: Tensor,
+    in_centres: Tensor,
 ) -> tuple[Tensor, Tensor]:
     far = np.array([0.0, 0.0, _APART_M])
     tree = cKDTree(
-        points.detach().numpy() + in_points.numpy()[:, None] * far, balanced_tree=False,
+        points.detach().numpy() + in_points.numpy()[:, None] * far,
+        balanced_tree=False,
         compact_nodes=False,
     )
     distance, index = tree.query(
@@ -90,7 +96,12 @@ def _by_tree(
 
 
 def _by_distances(
-    points: Tensor, centres: Tensor, radius_m: float, count: int, in_points: Tensor, in_centres: Tensor
+    points: Tensor,
+    centres: Tensor,
+    radius_m: float,
+    count: int,
+    in_points: Tensor,
+    in_centres: Tensor,
 ) -> tuple[Tensor, Tensor]:
     index = torch.zeros((len(centres), count), dtype=torch.long, device=centres.device)
     found = torch.zeros(len(centres), dtype=torch.long, device=centres.device)

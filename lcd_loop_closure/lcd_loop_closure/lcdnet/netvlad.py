@@ -24,7 +24,7 @@ class NetVlad(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Return descriptors [B x G] of unit length from features [B x N x D]."""
-        clouds, number, width = features.shape
+        clouds, number = features.shape[:2]
         scores = self.assign_norm((features @ self.assign).view(clouds * number, -1))
         a = torch.softmax(scores, -1).view(clouds, number, -1)
         vlad = vlad_sums(features, a, self.centres)

@@ -9,11 +9,15 @@ from torch import Tensor, nn
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
 from lcd_loop_closure.lcdnet.keypoints import above_ground, farthest_points
 from lcd_loop_closure.lcdnet.netvlad import NetVlad
+from lcd_loop_closure.lcdnet.point_backbones import EdgeConv, PointNet, RandlaNet
+from lcd_loop_closure.lcdnet.pose_heads import RegressionHead
 from lcd_loop_closure.lcdnet.pyramid import VoxelPyramid
 from lcd_loop_closure.lcdnet.set_abstraction import VoxelSetAbstraction
 from lcd_loop_closure.lcdnet.transport import SoftMatches, TransportHead
 from lcd_loop_closure.lcdnet.voxels import Clouds, Voxels, see
 from lcd_loop_closure.lcdnet.weighted_svd import weighted_svd
+
+_POINT_BACKBONES = {'pointnet': PointNet, 'edgeconv': EdgeConv, 'randla': RandlaNet}
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,19 @@ class Lcdnet(nn.Module):
     def __init__(self, settings: LcdnetConfig) -> None:
         super().__init__()
         s = self.settings = settings.check()
-        self.pyramid = VoxelPyramid(s)
-        self.abstraction = VoxelSetAbstraction(s, self.pyramid.bev_size)
+        self.pyramid: VoxelPyramid | None = None
+        self.abstraction: VoxelSetAbstraction | None = None
+        if s.backbone == 'pv_rcnn':
+            self.pyramid = VoxelPyramid(s)
+            self.abstraction = VoxelSetAbstraction(s, self.pyramid.bev_size)
+        else:
+            self.of_points = _POINT_BACKBONES[s.backbone](s.feature_size, s.reach)
         self.place = NetVlad(s.feature_size, s.clusters, s.descriptor_size)
-        self.transport = TransportHead(s.sinkhorn_iterations)
+        self.transport: TransportHead | None = None
+        if s.pose_head == 'uot':
+            self.transport = TransportHead(s.sinkhorn_iterations)
+        else:
+            self.regression = RegressionHead(s.pose_head, s.feature_size, s.reach)
 
     def forward(
         self,
@@ -60,24 +73,39 @@ class Lcdnet(nn.Module):
         """
         number = keypoints or self.settings.keypoints
         voxels = see(clouds, self.settings)
-        pyramid = self.pyramid(voxels, clouds.size)
         chosen = self._keypoints(clouds, voxels, number, generator)
         batch = torch.arange(clouds.size, device=chosen.device).repeat_interleave(number)
-        features = self.abstraction(clouds, voxels, pyramid, chosen, batch, generator)
-        features = features.view(clouds.size, number, -1)
+        if self.pyramid is not None and self.abstraction is not None:
+            pyramid = self.pyramid(voxels, clouds.size)
+            features = self.abstraction(clouds, voxels, pyramid, chosen, batch, generator)
+            features = features.view(clouds.size, number, -1)
+        else:
+            features = self.of_points(chosen.view(clouds.size, number, 3))
         return Features(
             chosen.view(clouds.size, number, 3), features, self.place(features), voxels.left_out
         )
 
-    def match(self, features: Features, source: Tensor, target: Tensor) -> SoftMatches:
-        """Match clouds `source` [P] of a batch softly to clouds `target` [P]."""
+    def match(self, features: Features, source: Tensor, target: Tensor) -> SoftMatches | None:
+        """Match clouds `source` [P] of a batch softly to clouds `target` [P].
+
+        None when the pose head does not match.
+        """
+        if self.transport is None:
+            return None
         return self.transport(
             features.features[source], features.features[target], features.keypoints[target]
         )
 
     def relative_pose(self, features: Features, source: Tensor, target: Tensor) -> Tensor:
-        """Return T_target_source [P x 4 x 4] of pairs in a batch, by transport alone ("fast")."""
+        """Return T_target_source [P x 4 x 4] of pairs in a batch, by the pose head ("fast")."""
         matches = self.match(features, source, target)
+        if matches is None:
+            return self.regression(
+                features.features[source],
+                features.keypoints[source],
+                features.features[target],
+                features.keypoints[target],
+            )
         return weighted_svd(features.keypoints[source].float(), matches.projected, matches.weight)
 
     def _keypoints(
@@ -87,7 +115,7 @@ class Lcdnet(nn.Module):
         number: int,
         generator: np.random.Generator | None,
     ) -> Tensor:
-        """Choose keypoints [B N x 3]: of the points, or of the finest voxels where those are coarse."""
+        """Choose keypoints [B N x 3]: of the points, or of the finest voxels if these are coarse."""
         s, chosen = self.settings, []
         of_points = not s.relative_input
         xyz = clouds.xyz if of_points else voxels.xyz

@@ -81,7 +81,9 @@ class PlaceShard:
         try:
             return cls(int(path.stem.split('_')[-1]), load_file(path))
         except Exception as error:
-            raise DataError(f'{path} holds no places ({error}); delete it to make it anew') from error
+            raise DataError(
+                f'{path} holds no places ({error}); delete it to make it anew'
+            ) from error
 
 
 def shard_of(town: int, places: Sequence[Sequence[PlaceSweep]]) -> PlaceShard:

@@ -119,5 +119,3 @@ class VoxelSetAbstraction(nn.Module):
             )
             out = out.index_copy(0, rows, sampled[0, :, :, 0].T)
         return out
-
-

@@ -212,9 +212,7 @@ class Trainer:
             time.monotonic() - begin,
         )
 
-    def _losses(
-        self, batch: Batch, rng: np.random.Generator
-    ) -> tuple[Losses, torch.Tensor, float]:
+    def _losses(self, batch: Batch, rng: np.random.Generator) -> tuple[Losses, torch.Tensor, float]:
         s = self.settings
         features = self.network(batch.clouds, keypoints=s.keypoints or None, generator=rng)
         loops = slice(0, batch.loops)
@@ -225,14 +223,14 @@ class Trainer:
         )  # fmt: skip
         points = features.keypoints[batch.source].float()
         matches = self.network.match(features, batch.source, batch.target)
-        T = weighted_svd(points, matches.projected, matches.weight)
-        losses = Losses(
-            triplet,
-            pose_loss(points, T, batch.T_target_source),
-            transport_loss(matches, points, batch.T_target_source),
-            violated,
-        )
-        matching = triplet.new_zeros(())
+        matching = transport = triplet.new_zeros(())
+        if matches is None:
+            T = self.network.relative_pose(features, batch.source, batch.target)
+        else:
+            T = weighted_svd(points, matches.projected, matches.weight)
+            transport = transport_loss(matches, points, batch.T_target_source)
+        pose = pose_loss(points, T, batch.T_target_source)
+        losses = Losses(triplet, pose, transport, violated)
         if s.matching_weight:
             unit = nn.functional.normalize(features.features.float(), dim=2)
             matching = matching_loss(

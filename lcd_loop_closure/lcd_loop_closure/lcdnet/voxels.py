@@ -27,7 +27,9 @@ class Clouds:
     size: int
 
     @classmethod
-    def of(cls, xyz: Sequence[Tensor], intensity: Sequence[Tensor | None] | None = None) -> 'Clouds':
+    def of(
+        cls, xyz: Sequence[Tensor], intensity: Sequence[Tensor | None] | None = None
+    ) -> 'Clouds':
         """Join clouds [M_i x 3] with their intensities [M_i]; None stands for no intensity."""
         given = intensity or [None] * len(xyz)
         values = [

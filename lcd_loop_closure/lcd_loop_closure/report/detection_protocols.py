@@ -1,102 +1,11 @@
-"""Judge loop detectors by what their descriptors say alone (thesis section 3.3.3)."""
+"""The former place of protocol 1."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from lcd_loop_closure.evaluation.detection_protocols import (
+    Candidates,
+    DistancesTo,
+    PrecisionRecall,
+    candidates,
+    protocol_1,
+)
 
-import numpy as np
-from numpy.typing import NDArray
-
-from lcd_loop_closure.revisits import RevisitConfig
-
-# Distances [M] from scan i to the scans 0..M-1.
-DistancesTo = Callable[[int, int], NDArray[np.floating]]
-
-
-@dataclass(frozen=True)
-class PrecisionRecall:
-    """A precision-recall curve and the area under it.
-
-    Attributes:
-        threshold: [K] increasing; a candidate is accepted when its distance is at most this.
-        precision, recall: [K] at these thresholds.
-        average_precision: sum of (R_k - R_k-1) P_k from the second threshold on, as in the thesis's
-            evaluation.
-        loops: scans that do return to a place.
-    """
-
-    threshold: NDArray[np.float64]
-    precision: NDArray[np.float64]
-    recall: NDArray[np.float64]
-    average_precision: float
-    loops: int
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """The most similar earlier scan of each scan.
-
-    Attributes:
-        query, match: [Q] scans.
-        distance: [Q] of their descriptors.
-        right: [Q] whether the match is near in truth.
-        loop: [Q] whether any earlier scan is.
-    """
-
-    query: NDArray[np.intp]
-    match: NDArray[np.intp]
-    distance: NDArray[np.float64]
-    right: NDArray[np.bool_]
-    loop: NDArray[np.bool_]
-
-
-def candidates(
-    distances_to: DistancesTo,
-    positions: NDArray[np.floating],
-    settings: RevisitConfig | None = None,
-) -> Candidates:
-    """Return what protocol 1 accepts or rejects.
-
-    Args:
-        distances_to: `distances_to(i, m)` gives the descriptor distances [m] of scan i to the scans
-            0 .. m - 1.
-        positions: [N x 3] true positions, metres.
-        settings: which scans count.
-    """
-    s = settings or RevisitConfig()
-    rows = []
-    for i in range(s.first_scan, len(positions)):
-        earlier = i - s.excluded_scans + 1
-        if earlier < 1:
-            continue
-        distance = np.asarray(distances_to(i, earlier))
-        best = int(np.argmin(distance))
-        near = np.linalg.norm(positions[:earlier] - positions[i], axis=1) <= s.distance
-        rows.append((i, best, float(distance[best]), bool(near[best]), bool(near.any())))
-    query, match, distances, right, loop = zip(*rows, strict=True) if rows else ([],) * 5
-    return Candidates(
-        np.array(query, np.intp),
-        np.array(match, np.intp),
-        np.array(distances, np.float64),
-        np.array(right, bool),
-        np.array(loop, bool),
-    )
-
-
-def protocol_1(found: Candidates) -> PrecisionRecall:
-    """Return precision and recall of the nearest candidates.
-
-    A wrong candidate at a real loop is a false positive when accepted, and a missed loop otherwise.
-    """
-    threshold = np.unique(found.distance)
-    order = np.argsort(found.distance, kind='stable')
-    distance, right, loop = found.distance[order], found.right[order], found.loop[order]
-    accepted = np.searchsorted(distance, threshold, side='right')
-    before = np.concatenate([[0], np.cumsum(right & loop)])
-    missed = np.concatenate([[0], np.cumsum(loop)])
-    true = before[accepted].astype(np.float64)
-    false = np.concatenate([[0], np.cumsum(~right)])[accepted]
-    not_found = missed[-1] - missed[accepted]
-    precision = np.divide(true, true + false, out=np.ones_like(true), where=true + false > 0)
-    recall = np.divide(true, true + not_found, out=np.zeros_like(true), where=true + not_found > 0)
-    area = float(np.sum(np.diff(recall) * precision[1:]))
-    return PrecisionRecall(threshold, precision, recall, area, int(loop.sum()))
+__all__ = ['Candidates', 'DistancesTo', 'PrecisionRecall', 'candidates', 'protocol_1']

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcd_loop_closure.report.detection_protocols import candidates, protocol_1
+from lcd_loop_closure.evaluation.detection_protocols import candidates, protocol_1
 from lcd_loop_closure.revisits import RevisitConfig
 
 SETTINGS = RevisitConfig(first_scan=10, excluded_scans=5)

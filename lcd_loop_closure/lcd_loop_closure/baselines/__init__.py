@@ -1,0 +1,1 @@
+"""What LCDNet is compared with: other place descriptors and other registrations of clouds."""

@@ -1,0 +1,98 @@
+"""Sum up how well pairs were registered (thesis section 3.3.4)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcd_common import se3
+from lcd_loop_closure.evaluation.proportion import Proportion
+
+# A registration counts when it is off by no more (thesis section 3.3.4).
+SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
+
+
+@dataclass(frozen=True)
+class RegistrationErrors:
+    """Errors of every pair; NaN where a method gave no answer.
+
+    Attributes:
+        te_m: [P] translation error.
+        re_deg: [P] rotation error, the whole angle.
+        yaw_deg: [P] error of the heading alone.
+        prepare_ms, register_ms: mean time for a cloud and for a pair.
+    """
+
+    te_m: NDArray[np.float64]
+    re_deg: NDArray[np.float64]
+    yaw_deg: NDArray[np.float64]
+    prepare_ms: float | None = None
+    register_ms: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.te_m)
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Which pairs count as registered, heading alone, as in the authors' evaluation."""
+        return (self.te_m <= SUCCESS_M) & (self.yaw_deg <= SUCCESS_DEG)
+
+    @property
+    def success_full(self) -> NDArray[np.bool_]:
+        """Which pairs count as registered by the whole rotation."""
+        return (self.te_m <= SUCCESS_M) & (self.re_deg <= SUCCESS_DEG)
+
+    def select(self, mask: NDArray[np.bool_]) -> 'RegistrationErrors':
+        """Return the errors of some pairs."""
+        return RegistrationErrors(
+            self.te_m[mask],
+            self.re_deg[mask],
+            self.yaw_deg[mask],
+            self.prepare_ms,
+            self.register_ms,
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """Return the single figures.
+
+        `success` and its 95 % Wilson interval by heading alone, `success_full` by the whole
+        rotation; errors as means and medians over successes (by the whole rotation) and, ending in
+        `_all`, over all pairs with an answer.
+        """
+        by_yaw = Proportion(int(self.success.sum()), len(self))
+        full = Proportion(int(self.success_full.sum()), len(self))
+        answered = np.isfinite(self.te_m)
+        figures: dict[str, Any] = {
+            'pairs': len(self),
+            'answered': int(answered.sum()),
+            'success': by_yaw.share,
+            'success_interval': None if by_yaw.interval is None else list(by_yaw.interval),
+            'success_full': full.share,
+            'success_full_interval': None if full.interval is None else list(full.interval),
+        }
+        for name, errors in (('te_m', self.te_m), ('re_deg', self.re_deg), ('yaw_deg', self.yaw_deg)):
+            for suffix, mask in (('', self.success_full), ('_all', answered)):
+                chosen = errors[mask]
+                figures[f'{name}{suffix}'] = float(chosen.mean()) if len(chosen) else None
+                figures[f'{name}_median{suffix}'] = float(np.median(chosen)) if len(chosen) else None
+        figures['prepare_ms'], figures['register_ms'] = self.prepare_ms, self.register_ms
+        return figures
+
+
+def errors_of(
+    T_estimated: list[se3.Array | None],
+    T_true: se3.Array,
+    prepare_ms: float | None = None,
+    register_ms: float | None = None,
+) -> RegistrationErrors:
+    """Compare poses T_match_query (None: no answer) with the true ones [P x 4 x 4]."""
+    te, re, yaw = (np.full(len(T_true), np.nan) for _ in range(3))
+    for k, T in enumerate(T_estimated):
+        if T is None or not np.isfinite(T).all():
+            continue
+        te[k], radians = se3.distance(T_true[k], np.asarray(T, np.float64))
+        re[k] = np.degrees(radians)
+        apart = se3.yaw(T) - se3.yaw(T_true[k])
+        yaw[k] = np.degrees(abs((apart + np.pi) % (2.0 * np.pi) - np.pi))
+    return RegistrationErrors(te, re, yaw, prepare_ms, register_ms)
