@@ -65,7 +65,7 @@ def judge(drive: SimulatedDrive) -> tuple[PrecisionRecall, dict[str, float]]:
     found = candidates(lambda i, m: descriptor.compare(table[i], table[:m])[0], poses[:, :3, 3])
     within, nearest_other, between = [], [], []
     for query in found.query[found.loop]:
-        earlier = int(query) - 49
+        earlier = int(query) - 50
         distance = descriptor.compare(table[query], table[:earlier])[0]
         away = np.linalg.norm(poses[:earlier, :3, 3] - poses[query, :3, 3], axis=1)
         within.append(distance[away <= 4.0].min())

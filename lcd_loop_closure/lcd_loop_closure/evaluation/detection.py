@@ -31,7 +31,7 @@ class Detection:
 
     Attributes:
         found: most similar scans, of protocol 1.
-        reverse: [Q] whether the nearest true place of a query was passed in another direction.
+        reverse: [Q] whether the place of a query was passed in another direction only.
         protocol_1: curve of each class: queries of the other class are left out.
         protocol_2: curve of each class: positive pairs of the other class are left out.
         pairs: that protocol 2 judged.
@@ -85,7 +85,7 @@ def judge_descriptor(
             away = np.linalg.norm(positions[:earlier] - positions[i], axis=1)
             near = away <= s.distance
             is_reverse = passed_reverse(heading[i], heading[:earlier])
-            reverse_query.append(bool(near.any() and is_reverse[np.argmin(away)]))
+            reverse_query.append(bool(near.any() and is_reverse[near].all()))
             positive.append(distance[near])
             turned.append(is_reverse[near])
             block.append(distance[~near])

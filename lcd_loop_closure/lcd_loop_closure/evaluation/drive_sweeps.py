@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bags.inputs import is_town
 from bags.records import Drive, LidarScan
 from lcd_common import se3
 from lcd_common.errors import DataError
@@ -100,7 +99,9 @@ def _scans(drive: Drive) -> int:
 
 
 def _read(drive: Drive, wanted: NDArray[np.int64] | None) -> Iterator[LidarScan]:
-    if wanted is not None and is_town(drive.name.replace('_', ':', 1)):
+    from bags.simulation.drive import SimulatedDrive  # scipy: not before it is needed
+
+    if wanted is not None and isinstance(drive, SimulatedDrive):
         # A simulated sweep costs its rendering: only those wanted are asked for.
         for stamp in wanted:
             for record in drive.records(int(stamp), int(stamp), [LidarScan]):

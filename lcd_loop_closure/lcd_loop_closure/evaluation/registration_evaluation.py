@@ -3,32 +3,30 @@
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
+from lcd_loop_closure.baselines.registration import CloudRegistration
 from lcd_loop_closure.evaluation.registration_errors import RegistrationErrors, errors_of
 from lcd_loop_closure.evaluation.registration_pairs import RegistrationPairs
-from lcd_loop_closure.evaluation.registration_protocol import CloudRegistration
-
-Prepared = TypeVar('Prepared')
 
 # Prepared clouds held at a time: pairs come by query, so matches move along a drive as well.
 _HELD = 400
 
 
-class PreparedClouds(Generic[Prepared]):
+class PreparedClouds:
     """Prepare clouds when they are first asked for and hold the latest."""
 
     def __init__(
-        self, registration: CloudRegistration[Prepared], cloud_of: Callable[[int], PointCloud]
+        self, registration: CloudRegistration, cloud_of: Callable[[int], PointCloud]
     ) -> None:
         self._registration, self._cloud_of = registration, cloud_of
-        self._held: OrderedDict[int, Prepared] = OrderedDict()
+        self._held: OrderedDict[int, Any] = OrderedDict()
         self.seconds, self.prepared = 0.0, 0
 
-    def get(self, scan: int) -> Prepared:
+    def get(self, scan: int) -> Any:
         """Return a prepared scan."""
         if scan in self._held:
             self._held.move_to_end(scan)
@@ -45,7 +43,7 @@ class PreparedClouds(Generic[Prepared]):
 
 
 def evaluate_registration(
-    registration: CloudRegistration[Prepared],
+    registration: CloudRegistration,
     cloud_of: Callable[[int], PointCloud],
     pairs: RegistrationPairs,
     *,

@@ -22,8 +22,8 @@ def noisy_drive(noise: float) -> tuple[np.ndarray, np.ndarray]:
 def by_definition(positions: np.ndarray, descriptors: np.ndarray) -> float:
     found = []
     for i in range(10, len(positions)):
-        d = np.linalg.norm(descriptors[: i - 4] - descriptors[i], axis=1)
-        near = np.linalg.norm(positions[: i - 4] - positions[i], axis=1) <= 4.0
+        d = np.linalg.norm(descriptors[: i - 5] - descriptors[i], axis=1)
+        near = np.linalg.norm(positions[: i - 5] - positions[i], axis=1) <= 4.0
         found.append((d.min(), near[d.argmin()], near.any()))
     precision, recall = [], []
     for threshold in sorted({row[0] for row in found}):
