@@ -16,6 +16,7 @@ from lcd_loop_closure.voxel_gaussians import VoxelGaussians
 from lcd_loop_closure.yaw_search import yaw_candidates
 
 _SAMPLE = 1000  # points of a sweep that are matched with surfaces
+_BRIEF_SHARE = 3  # one point of so many is enough for a pose that the polish will improve
 _RECENT = 20  # sweeps whose fitness says what is usual
 _DOUBTFUL = 0.75  # of the usual fitness: less is worth a search
 _BETTER = 1.1  # times the fitness that a search must find to be believed
@@ -153,7 +154,8 @@ class SweepRegistration:
             rough: for a guess that may be far off or wrong.
             brief: leave the last centimetres to the polish, which is faster at it.
         """
-        T_kiss = self._kiss.align(sweep.source, guess, rough=rough, brief=brief)
+        source = sweep.source[::_BRIEF_SHARE] if brief else sweep.source
+        T_kiss = self._kiss.align(source, guess, rough=rough, brief=brief)
         on_surfaces = self.polished(sweep, T_kiss, prior)
         disagreement = se3.log(se3.inverse(T_kiss) @ on_surfaces.T_odom_middle)
         if not self.settings.polish:
