@@ -10,30 +10,19 @@ from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError, DataError
-from lcd_common.settings import config, setting
 from lcd_loop_closure.descriptor_index import Euclidean
 from lcd_loop_closure.lcdnet.checkpoint import load_network
+from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import thinned
 from lcd_loop_closure.lcdnet.voxels import Clouds
+from lcd_loop_closure.lcdnet_settings import LcdnetDescriptorConfig
 from lcd_loop_closure.local_features import LocalFeatures
 
 PACKAGED = Path(__file__).with_name('weights') / 'lcdnet_compact.safetensors'
 # Fewer points show no place.
 _LEAST_POINTS = 100
 _logger = logging.getLogger(__name__)
-
-
-@config
-class LcdnetDescriptorConfig:
-    """Which network, and where it runs."""
-
-    weights: str = setting('', 'file of train_lcdnet; empty: the compact one that ships')
-    device: str = setting('auto', 'auto (a GPU where there is one), cpu, cuda or cuda:N')
-    threads: int = setting(0, 'of torch in this process; 0 leaves them as they are', low=0)
-    full_intensity: float = setting(
-        1.0, 'intensity of the brightest return; 0: the sensor has none', low=0.0
-    )
 
 
 @dataclass(frozen=True)
@@ -68,10 +57,10 @@ class LcdnetDescriptor:
 
         Raises:
             ConfigError: there are no weights, or no such device.
-            DataError: the file holds none.
+            DataError: the file holds other things.
         """
         self.settings = s = settings or LcdnetDescriptorConfig()
-        self.device = _device(s.device)
+        self.device = choose_device(s.device)
         if s.threads:
             torch.set_num_threads(s.threads)
         self.network = _load(s.weights, self.device) if network is None else network
@@ -79,6 +68,11 @@ class LcdnetDescriptor:
         self._metric = Euclidean(self.length)
         self._last: tuple[PointCloud, SweepFeatures] | None = None
         self._warned = False
+
+    @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+        return self.settings.max_distance
 
     @property
     def length(self) -> int:
@@ -109,8 +103,9 @@ class LcdnetDescriptor:
         Raises:
             DataError: it has too few points.
         """
-        if self._last is not None and self._last[0] is cloud:
-            return self._last[1]
+        last = self._last  # another thread may be at work
+        if last is not None and last[0] is cloud:
+            return last[1]
         seen = thinned(cloud.finite())
         if len(seen) < _LEAST_POINTS:
             raise DataError(
@@ -160,18 +155,6 @@ class LcdnetDescriptor:
         return None
 
 
-def _device(name: str) -> torch.device:
-    if name == 'auto':
-        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ConfigError(f'device must be auto, cpu, cuda or cuda:N, got {name!r}') from None
-    if device.type == 'cuda' and not torch.cuda.is_available():
-        raise ConfigError(f'device {name} was asked for, and torch sees no GPU; use auto or cpu')
-    return device
-
-
 def _load(weights: str, device: torch.device) -> Lcdnet:
     path = Path(weights) if weights else PACKAGED
     if not path.is_file():
@@ -181,5 +164,11 @@ def _load(weights: str, device: torch.device) -> Lcdnet:
             else 'train them with train_lcdnet and name the file, or choose another detector'
         )
         raise ConfigError(f'{path}: expected the weights of LCDNet, found none; {advice}')
-    network, _ = load_network(path, device)
+    try:
+        network, _ = load_network(path, device)
+    except DataError as error:
+        # Of a network of another shape torch names every tensor.
+        raise DataError(
+            f'{str(error).splitlines()[0][:300]}; name the best.safetensors of train_lcdnet'
+        ) from None
     return network

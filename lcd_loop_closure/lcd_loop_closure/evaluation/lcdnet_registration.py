@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_loop_closure.lcdnet.feature_registration import (
+from lcd_loop_closure.feature_registration import (
     FeatureHypothesis,
     FeatureRegistration,
     FeatureRegistrationConfig,

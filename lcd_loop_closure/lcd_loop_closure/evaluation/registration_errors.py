@@ -1,6 +1,6 @@
 """Sum up how well pairs were registered (thesis section 3.3.4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ class RegistrationErrors:
         re_deg: [P] rotation error, the whole angle.
         yaw_deg: [P] error of the heading alone.
         prepare_ms, register_ms: mean time for a cloud and for a pair.
+        yaw_only: the method tells heading alone: translation does not count.
     """
 
     te_m: NDArray[np.float64]
@@ -29,6 +30,7 @@ class RegistrationErrors:
     yaw_deg: NDArray[np.float64]
     prepare_ms: float | None = None
     register_ms: float | None = None
+    yaw_only: bool = False
 
     def __len__(self) -> int:
         return len(self.te_m)
@@ -36,7 +38,7 @@ class RegistrationErrors:
     @property
     def success(self) -> NDArray[np.bool_]:
         """Which pairs count as registered, heading alone, as in the authors' evaluation."""
-        return (self.te_m <= SUCCESS_M) & (self.yaw_deg <= SUCCESS_DEG)
+        return (self.yaw_only | (self.te_m <= SUCCESS_M)) & (self.yaw_deg <= SUCCESS_DEG)
 
     @property
     def success_full(self) -> NDArray[np.bool_]:
@@ -45,12 +47,8 @@ class RegistrationErrors:
 
     def select(self, mask: NDArray[np.bool_]) -> 'RegistrationErrors':
         """Return the errors of some pairs."""
-        return RegistrationErrors(
-            self.te_m[mask],
-            self.re_deg[mask],
-            self.yaw_deg[mask],
-            self.prepare_ms,
-            self.register_ms,
+        return replace(
+            self, te_m=self.te_m[mask], re_deg=self.re_deg[mask], yaw_deg=self.yaw_deg[mask]
         )
 
     def plain(self) -> dict[str, Any]:
@@ -62,17 +60,21 @@ class RegistrationErrors:
         """
         by_yaw = Proportion(int(self.success.sum()), len(self))
         full = Proportion(int(self.success_full.sum()), len(self))
-        answered = np.isfinite(self.te_m)
+        answered = np.isfinite(self.yaw_deg)
+        counted = self.success if self.yaw_only else self.success_full
         figures: dict[str, Any] = {
             'pairs': len(self),
             'answered': int(answered.sum()),
             'success': by_yaw.share,
             'success_interval': None if by_yaw.interval is None else list(by_yaw.interval),
-            'success_full': full.share,
-            'success_full_interval': None if full.interval is None else list(full.interval),
         }
-        for name, errors in (('te_m', self.te_m), ('re_deg', self.re_deg), ('yaw_deg', self.yaw_deg)):
-            for suffix, mask in (('', self.success_full), ('_all', answered)):
+        kinds = {'yaw_deg': self.yaw_deg}
+        if not self.yaw_only:
+            figures['success_full'] = full.share
+            figures['success_full_interval'] = None if full.interval is None else list(full.interval)
+            kinds |= {'te_m': self.te_m, 're_deg': self.re_deg}
+        for name, errors in kinds.items():
+            for suffix, mask in (('', counted), ('_all', answered)):
                 chosen = errors[mask]
                 figures[f'{name}{suffix}'] = float(chosen.mean()) if len(chosen) else None
                 figures[f'{name}_median{suffix}'] = float(np.median(chosen)) if len(chosen) else None
@@ -85,6 +87,8 @@ def errors_of(
     T_true: se3.Array,
     prepare_ms: float | None = None,
     register_ms: float | None = None,
+    *,
+    yaw_only: bool = False,
 ) -> RegistrationErrors:
     """Compare poses T_match_query (None: no answer) with the true ones [P x 4 x 4]."""
     te, re, yaw = (np.full(len(T_true), np.nan) for _ in range(3))
@@ -95,4 +99,4 @@ def errors_of(
         re[k] = np.degrees(radians)
         apart = se3.yaw(T) - se3.yaw(T_true[k])
         yaw[k] = np.degrees(abs((apart + np.pi) % (2.0 * np.pi) - np.pi))
-    return RegistrationErrors(te, re, yaw, prepare_ms, register_ms)
+    return RegistrationErrors(te, re, yaw, prepare_ms, register_ms, yaw_only)

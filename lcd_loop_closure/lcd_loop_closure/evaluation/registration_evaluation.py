@@ -76,5 +76,6 @@ def evaluate_registration(
         pairs.T_match_query,
         1e3 * clouds.seconds / clouds.prepared if clouds.prepared else None,
         1e3 * seconds / len(pairs) if len(pairs) else None,
+        yaw_only=getattr(registration, 'yaw_only', False),
     )
     return errors, answers
