@@ -24,13 +24,13 @@ class IntensityScanContextConfig:
     max_range: float = setting(80.0, 'distance covered by the rings', unit='m', low=5.0)
     min_height: float = setting(
         0.83,
-        'points lower above the ground are left out, as the ground in the authors\' code, where '
-        'the limit is -0.9 m from KITTI\'s LiDAR',
+        "points lower above the ground are left out, as the ground in the authors' code, where "
+        "the limit is -0.9 m from KITTI's LiDAR",
         unit='m',
     )
     full_intensity: float = setting(1.0, 'intensity of the brightest return', low=1e-3)
     turn_tolerance: int = setting(
-        2, 'sectors around the turn of the best geometry in which intensities are compared', low=0
+        0, 'sectors around the turn of the best geometry in which intensities are compared', low=0
     )
     min_geometry: float = setting(
         0.0,

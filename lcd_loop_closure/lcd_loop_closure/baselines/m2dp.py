@@ -26,7 +26,7 @@ class M2dpConfig:
         'skewness',
         'what turns the principal axes to one of their two ends: the longer tail of the points '
         'along them, as invariance under rotation needs, or their largest coordinate in the base '
-        'frame, as MATLAB does in the authors\' code and which a turned vehicle defeats',
+        "frame, as MATLAB does in the authors' code and which a turned vehicle defeats",
         choices=('skewness', 'largest'),
     )
 
