@@ -160,15 +160,15 @@ def _negative_pairs(
     data = folder() / 'data'
     sets = {
         'kitti_00': list(within.values()),
-        'kitti_360': [prepare(pairs, cloud) for cloud in _clouds(data / 'kitti_360')],
+        'kitti_360': [prepare(pairs, cloud) for cloud in clouds(data / 'kitti_360')],
         'argoverse2': [
-            prepare(pairs, cloud) for cloud in _clouds(data / 'argoverse2' / '7fab2350')
+            prepare(pairs, cloud) for cloud in clouds(data / 'argoverse2' / '7fab2350')
         ],
     }
     for (a, matches), (b, queries) in itertools.combinations(sets.items(), 2):
         for (i, match), (j, query) in itertools.product(enumerate(matches), enumerate(queries)):
             yield f'{a}+{b}', i, j, pairs.compare(match, query)
-    sweeps = itertools.islice(_clouds(karlsruhe_out_and_back(work).parents[1]), 0, None, sweep_step)
+    sweeps = itertools.islice(clouds(karlsruhe_out_and_back(work).parents[1]), 0, None, sweep_step)
     # In blocks: the prepared sweeps of the whole drive would fill a gigabyte.
     for block in itertools.count():
         part = list(itertools.islice(sweeps, _BLOCK))
@@ -181,7 +181,8 @@ def _negative_pairs(
                 yield f'karlsruhe+{name}', number, j, pairs.compare(match, query)
 
 
-def _clouds(path: Path) -> Iterator[PointCloud]:
+def clouds(path: Path) -> Iterator[PointCloud]:
+    """Yield the sweeps of a recording, LiDAR frame."""
     for record in open_drive(path).records(kinds=[LidarScan]):
         assert isinstance(record, LidarScan)
         yield record.cloud

@@ -1,4 +1,4 @@
-"""Find the nearest among a million descriptors: all of them in a byte a number, the best in full."""
+"""Find the nearest of a million descriptors: all of them with eight bits, the best in full."""
 
 from functools import cache
 

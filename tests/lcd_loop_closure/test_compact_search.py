@@ -36,9 +36,7 @@ def test_the_answer_is_that_of_comparing_everything(monkeypatch, kernel, alike):
         numbers, distances = search.nearest(query, 10)
         expected = exact(rows, query, 10)
         assert set(numbers) == set(expected)
-        assert distances == pytest.approx(
-            np.linalg.norm(rows[expected] - query, axis=1), abs=1e-6
-        )
+        assert distances == pytest.approx(np.linalg.norm(rows[expected] - query, axis=1), abs=1e-6)
 
 
 def test_a_vector_finds_itself_first_and_equal_ones_in_order():

@@ -5,12 +5,23 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lcd_loop_closure.descriptor_index import PlaceDescriptor
+from lcd_common.cloud import PointCloud
+from lcd_loop_closure.descriptor_index import Metric
 from lcd_loop_closure.evaluation.sweep_views import Sweeps
+
+
+class SweepDescriptor(Metric, Protocol):
+    """How sweeps are described and compared; `name` is what files are called."""
+
+    name: str
+
+    def describe(self, cloud: PointCloud) -> NDArray[np.float32]:
+        """Return the descriptor of a sweep in the base frame."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +38,7 @@ class Descriptions:
 
 
 def describe_sweeps(
-    descriptor: PlaceDescriptor,
+    descriptor: SweepDescriptor,
     sweeps: Sweeps,
     *,
     folder: Path | None = None,

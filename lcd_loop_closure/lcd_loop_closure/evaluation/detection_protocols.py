@@ -139,8 +139,9 @@ def protocol_1(found: Candidates) -> PrecisionRecall:
     """Return precision and recall of the nearest candidates.
 
     A wrong candidate at a real loop is a false positive when accepted, and a missed loop otherwise.
+    A scan without a candidate, at an infinite distance, is never accepted.
     """
-    threshold = np.unique(found.distance)
+    threshold = np.unique(found.distance[np.isfinite(found.distance)])
     order = np.argsort(found.distance, kind='stable')
     distance, right, loop = found.distance[order], found.right[order], found.loop[order]
     accepted = np.searchsorted(distance, threshold, side='right')

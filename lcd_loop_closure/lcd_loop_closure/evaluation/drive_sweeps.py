@@ -93,9 +93,7 @@ def _spaced_stamps(truth: Trajectory, spacing_m: float) -> NDArray[np.int64]:
 
 
 def _scans(drive: Drive) -> int:
-    return max(
-        (s.count for s in drive.streams() if s.type_name.endswith('PointCloud2')), default=0
-    )
+    return max((s.count for s in drive.streams() if s.type_name.endswith('PointCloud2')), default=0)
 
 
 def _read(drive: Drive, wanted: NDArray[np.int64] | None) -> Iterator[LidarScan]:

@@ -218,7 +218,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='evaluate_loops',
         description=__doc__,
-        epilog=_EXAMPLES + _listed('methods', DESCRIPTORS) + _listed('registrations', REGISTRATIONS),
+        epilog=_EXAMPLES
+        + _listed('methods', DESCRIPTORS)
+        + _listed('registrations', REGISTRATIONS),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_input(parser)
@@ -262,7 +264,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _listed(title: str, names: dict[str, str]) -> str:
     width = max(map(len, names))
-    return f'\n{title}:\n' + ''.join(f'  {name:<{width}}  {text}\n' for name, text in names.items())
+    lines = [f'  {name:<{width}}  {text}\n' for name, text in names.items()]
+    return f'\n{title}:\n' + ''.join(lines)
 
 
 def _positive(kind: Callable[[str], float]) -> Callable[[str], float]:

@@ -87,7 +87,7 @@ def icp_pairs(
 def drawn_pairs(
     T_world_base: se3.Array, settings: IcpPairsConfig, seed: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Return match, query and level [P] of one neighbour for each scan and level, where there is."""
+    """Return match, query and level [P]: a neighbour for each scan and level that has one."""
     from lcd_loop_closure.evaluation.registration_pairs import Band, choose_pairs
 
     s = settings

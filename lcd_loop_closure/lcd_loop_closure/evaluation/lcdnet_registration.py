@@ -1,25 +1,17 @@
 """Register clouds by LCDNet in the ways that the thesis tells apart (section 3.2.5)."""
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_loop_closure.feature_registration import (
-    FeatureHypothesis,
-    FeatureRegistration,
-    FeatureRegistrationConfig,
-)
+from lcd_loop_closure.feature_registration import FeatureRegistration, FeatureRegistrationConfig
 from lcd_loop_closure.lcdnet.network import Features
 from lcd_loop_closure.lcdnet_descriptor import LcdnetDescriptor
 from lcd_loop_closure.local_features import LocalFeatures
+from lcd_loop_closure.loop import LoopStatus
+from lcd_loop_closure.pair_registration import PairRegistration, PairResult, PreparedCloud
 from lcd_loop_closure.reduction import ReductionConfig, reduce_cloud
-from lcd_loop_closure.refinement import Refinement, Surface
-from lcd_loop_closure.verification import Verification
 
 
 class LcdnetFast:
@@ -66,60 +58,39 @@ class LcdnetRansac:
 
     def register(self, match: LocalFeatures, query: LocalFeatures) -> se3.Array | None:
         """Return T_match_query; None without enough matches that agree."""
-        found = self.search(match, query)
-        return found[0].T_match_query if found else None
-
-    def search(self, match: LocalFeatures, query: LocalFeatures) -> list[FeatureHypothesis]:
-        """Return the best motions, best first."""
-        return self._registration.search(
+        found = self._registration.search(
             query.keypoints,
             query.values.astype(np.float32),
             match.keypoints,
             match.values.astype(np.float32),
         )
+        return found[0].T_match_query if found else None
 
 
-@dataclass(frozen=True)
-class RefinedSweep:
-    """A sweep made ready for `LcdnetRefined`."""
+class NodeRegistration:
+    """What the loop-closure node runs on two keyframes: features, refinement, verification.
 
-    local: LocalFeatures
-    xyz: NDArray[np.float32]
-    refinement: Refinement
+    As `lcdnet` it answers with its best pose even where the verification rejects that; as
+    `lcdnet_accepted` with what the node would pass on.
+    """
 
-    @cached_property
-    def surface(self) -> Surface:
-        """Points of the reduced cloud with their covariances."""
-        return self.refinement.surface(self.xyz)
+    def __init__(self, descriptor: LcdnetDescriptor, *, accepted_only: bool = False) -> None:
+        self.name = 'lcdnet_accepted' if accepted_only else 'lcdnet'
+        self._descriptor, self._accepted_only = descriptor, accepted_only
+        self._pairs = PairRegistration()
 
-    @property
-    def ground_z(self) -> float:
-        """Height below which points are ground."""
-        return 0.0
-
-
-class LcdnetRefined:
-    """By features, then GICP from the best answers: what the node runs on two keyframes."""
-
-    name = 'lcdnet'
-
-    def __init__(self, descriptor: LcdnetDescriptor) -> None:
-        self._rough = LcdnetRansac(descriptor)
-        self._refinement, self._verification = Refinement(), Verification()
-
-    def prepare(self, cloud: PointCloud) -> RefinedSweep:
+    def prepare(self, cloud: PointCloud) -> PreparedCloud:
         """Return features and the cloud that a keyframe keeps."""
         reduced = reduce_cloud(cloud, ReductionConfig())
-        return RefinedSweep(self._rough.prepare(cloud), reduced.xyz, self._refinement)
+        return self._pairs.prepare(reduced.xyz, self._descriptor.features(cloud))
 
-    def register(self, match: RefinedSweep, query: RefinedSweep) -> se3.Array | None:
-        """Return T_match_query of the answer whose clouds fit best; None without an answer."""
-        fits = []
-        for hypothesis in self._rough.search(match.local, query.local):
-            T = self._refinement.approach(match.surface, query.surface, hypothesis.T_match_query)
-            fitness = self._verification.fitness(match.surface, query.surface, T, query.ground_z)
-            fits.append((fitness, T))
-        if not fits:
+    def register(self, match: PreparedCloud, query: PreparedCloud) -> se3.Array | None:
+        """Return T_match_query; None without an answer."""
+        result = self.judge(match, query)
+        if self._accepted_only and result.status is not LoopStatus.ACCEPTED:
             return None
-        _, T_match_query = max(fits, key=lambda fit: fit[0])
-        return self._refinement.refine(match.surface, query.surface, T_match_query).T_match_query
+        return result.T_match_query
+
+    def judge(self, match: PreparedCloud, query: PreparedCloud) -> PairResult:
+        """Return the pose and the verdict on it."""
+        return self._pairs.compare(match, query)

@@ -9,7 +9,7 @@ from typing import Any
 
 from lcd_common.errors import ConfigError
 from lcd_loop_closure.baselines.registration import CloudRegistration, RefinedRegistration
-from lcd_loop_closure.descriptor_index import PlaceDescriptor
+from lcd_loop_closure.evaluation.descriptions import SweepDescriptor
 from lcd_loop_closure.evaluation.yaw_registration import YawRegistration
 from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 
@@ -22,7 +22,8 @@ DESCRIPTORS: dict[str, str] = {
     'lidar_iris': 'LiDAR-Iris',
 }
 REGISTRATIONS: dict[str, str] = {
-    'lcdnet': 'LCDNet: features, GICP from the best answers',
+    'lcdnet': 'what the node runs: features, refined by GICP',
+    'lcdnet_accepted': 'the same, where its verification accepts',
     'lcdnet_ransac': 'LCDNet: features alone',
     'lcdnet_fast': 'LCDNet: transport head alone',
     'lcdnet_icp': 'LCDNet: features, then point-to-point ICP',
@@ -50,7 +51,7 @@ class Method:
     """
 
     name: str
-    descriptor: PlaceDescriptor
+    descriptor: SweepDescriptor
     key: str
 
 
@@ -71,7 +72,7 @@ class Methods:
         """
         if name not in DESCRIPTORS:
             raise ConfigError(f'no method {name!r}; there are {", ".join(DESCRIPTORS)}')
-        makers: dict[str, Callable[[], PlaceDescriptor]] = {
+        makers: dict[str, Callable[[], SweepDescriptor]] = {
             'lcdnet': lambda: self.lcdnet,
             'scan_context': ScanContext,
             'scan_context_50': lambda: ScanContext(ScanContextConfig(shortlist=50)),
@@ -102,7 +103,8 @@ class Methods:
     @cached_property
     def lcdnet(self) -> Any:
         """The network."""
-        from lcd_loop_closure.lcdnet_descriptor import LcdnetDescriptor, LcdnetDescriptorConfig
+        from lcd_loop_closure.lcdnet_descriptor import LcdnetDescriptor
+        from lcd_loop_closure.lcdnet_settings import LcdnetDescriptorConfig
 
         return LcdnetDescriptor(
             LcdnetDescriptorConfig(
@@ -116,16 +118,18 @@ class Methods:
         from lcd_loop_closure.evaluation.lcdnet_registration import (
             LcdnetFast,
             LcdnetRansac,
-            LcdnetRefined,
+            NodeRegistration,
         )
 
         if name == 'lcdnet_icp':
             from lcd_loop_closure.baselines.icp import Icp
 
             return RefinedRegistration(LcdnetRansac(self.lcdnet), Icp())
-        kinds = {'lcdnet_fast': LcdnetFast, 'lcdnet_ransac': LcdnetRansac, 'lcdnet': LcdnetRefined}
-        made: CloudRegistration = kinds[name](self.lcdnet)
-        return made
+        if name == 'lcdnet_fast':
+            return LcdnetFast(self.lcdnet)
+        if name == 'lcdnet_ransac':
+            return LcdnetRansac(self.lcdnet)
+        return NodeRegistration(self.lcdnet, accepted_only=name == 'lcdnet_accepted')
 
     def _weights_hash(self) -> str:
         from lcd_loop_closure.lcdnet_descriptor import PACKAGED
@@ -133,12 +137,12 @@ class Methods:
         path = self._weights or PACKAGED
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
 
-    def _m2dp(self) -> PlaceDescriptor:
+    def _m2dp(self) -> SweepDescriptor:
         from lcd_loop_closure.baselines.m2dp import M2dp
 
         return M2dp()
 
-    def _isc(self) -> PlaceDescriptor:
+    def _isc(self) -> SweepDescriptor:
         from lcd_loop_closure.baselines.intensity_scan_context import (
             IntensityScanContext,
             IntensityScanContextConfig,
@@ -146,7 +150,7 @@ class Methods:
 
         return IntensityScanContext(IntensityScanContextConfig(full_intensity=self._full))
 
-    def _iris(self) -> PlaceDescriptor:
+    def _iris(self) -> SweepDescriptor:
         from lcd_loop_closure.baselines.lidar_iris import LidarIris
 
         return LidarIris()

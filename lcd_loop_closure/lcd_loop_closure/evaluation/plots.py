@@ -37,7 +37,10 @@ def draw_precision_recall(ax: Axes, curves: Mapping[str, PrecisionRecall]) -> No
     ax.set_xlabel('recall')
     ax.set_ylabel('precision')
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(title='average precision', loc='lower left', fontsize=8, title_fontsize=8)
+        ax.legend(
+            title='average precision', loc='lower left', fontsize=8, title_fontsize=8,
+            frameon=True, framealpha=0.85, edgecolor='none',
+        )  # fmt: skip
 
 
 def draw_detections(ax: Axes, T_world_base: se3.Array, detection: Detection) -> None:

@@ -24,11 +24,11 @@ class Proportion:
         return self.successes / self.trials if self.trials else None
 
     @property
-    def interval(self) -> tuple[float, float] | None:
+    def interval(self) -> list[float] | None:
         """Ends of the interval; None without trials."""
         if not self.trials:
             return None
         n, p, z2 = self.trials, self.successes / self.trials, _Z95**2
         middle = (p + z2 / (2 * n)) / (1 + z2 / n)
         half = _Z95 * np.sqrt(p * (1 - p) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-        return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+        return [max(0.0, float(middle - half)), min(1.0, float(middle + half))]

@@ -1,5 +1,6 @@
 """Sum up how well pairs were registered (thesis section 3.3.4)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -66,20 +67,39 @@ class RegistrationErrors:
             'pairs': len(self),
             'answered': int(answered.sum()),
             'success': by_yaw.share,
-            'success_interval': None if by_yaw.interval is None else list(by_yaw.interval),
+            'success_interval': by_yaw.interval,
         }
         kinds = {'yaw_deg': self.yaw_deg}
         if not self.yaw_only:
             figures['success_full'] = full.share
-            figures['success_full_interval'] = None if full.interval is None else list(full.interval)
+            figures['success_full_interval'] = full.interval
             kinds |= {'te_m': self.te_m, 're_deg': self.re_deg}
         for name, errors in kinds.items():
             for suffix, mask in (('', counted), ('_all', answered)):
-                chosen = errors[mask]
-                figures[f'{name}{suffix}'] = float(chosen.mean()) if len(chosen) else None
-                figures[f'{name}_median{suffix}'] = float(np.median(chosen)) if len(chosen) else None
+                chosen = errors[mask] if mask.any() else None
+                mean = None if chosen is None else float(chosen.mean())
+                median = None if chosen is None else float(np.median(chosen))
+                figures[f'{name}{suffix}'], figures[f'{name}_median{suffix}'] = mean, median
         figures['prepare_ms'], figures['register_ms'] = self.prepare_ms, self.register_ms
         return figures
+
+
+def joined_errors(parts: Sequence[RegistrationErrors]) -> RegistrationErrors:
+    """Return the errors of one method on the pairs of several drives; times are averaged."""
+
+    def mean(name: str) -> float | None:
+        known = [(getattr(p, name), len(p)) for p in parts if getattr(p, name) is not None]
+        pairs = sum(number for _, number in known)
+        return sum(value * number for value, number in known) / pairs if pairs else None
+
+    return RegistrationErrors(
+        np.concatenate([part.te_m for part in parts]),
+        np.concatenate([part.re_deg for part in parts]),
+        np.concatenate([part.yaw_deg for part in parts]),
+        mean('prepare_ms'),
+        mean('register_ms'),
+        any(part.yaw_only for part in parts),
+    )
 
 
 def errors_of(

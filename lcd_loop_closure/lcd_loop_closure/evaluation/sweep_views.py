@@ -1,5 +1,6 @@
 """Sweeps of a drive as a sensor would see them whose view is partly blocked, or with a memory."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -91,6 +92,20 @@ class Aggregated:
             intensity = np.concatenate([part.intensity for part in parts])
         whole = PointCloud(np.concatenate([part.xyz for part in parts]), intensity)
         return whole.select(voxel_first(whole.xyz, 0.1))
+
+
+class Joined:
+    """Sweeps of several drives through one world, one drive after the other."""
+
+    def __init__(self, drives: Sequence[Sweeps], name: str) -> None:
+        self._drives, self.name = drives, name
+        self._begin = np.cumsum([0, *(len(drive.T_world_base) for drive in drives)])
+        self.T_world_base = np.concatenate([drive.T_world_base for drive in drives])
+
+    def cloud(self, number: int) -> PointCloud:
+        """Return one sweep, base frame."""
+        drive = int(np.searchsorted(self._begin, number, side='right')) - 1
+        return self._drives[drive].cloud(number - int(self._begin[drive]))
 
 
 def without_sector(cloud: PointCloud, middle_rad: float, width_rad: float) -> PointCloud:

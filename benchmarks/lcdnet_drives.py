@@ -1,0 +1,188 @@
+"""Loop detection on simulated drives through test towns, every method on the same sweeps."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bags.simulation.drive import SensorsConfig, SimulatedDrive
+from bags.simulation.itinerary import JourneyConfig
+from bags.simulation.stream import TEST_SEEDS
+from benchmarks.lcdnet_peers import judge_map_closures
+from lcd_common.errors import LocalizationError
+from lcd_loop_closure.evaluation.drive_sweeps import store_drive
+from lcd_loop_closure.evaluation.methods import Methods
+from lcd_loop_closure.evaluation.study import JudgedMethod, study_detection, terminal_bar
+from lcd_loop_closure.evaluation.sweep_store import StoredSweeps, is_stored
+from lcd_loop_closure.evaluation.sweep_views import (
+    Aggregated,
+    Joined,
+    RearBlocked,
+    SectorRemoved,
+    Sweeps,
+)
+from lcd_loop_closure.revisits import RevisitConfig
+
+METHODS = ('lcdnet', 'scan_context', 'scan_context_50', 'm2dp', 'isc', 'lidar_iris')
+_SPACING_M = 1.0  # KITTI's cars take a scan a metre
+# One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
+_SHARES = {'same_way': (0.3, 0.0), 'reverse': (0.0, 0.3)}
+LENGTH_M = 2500.0
+_UNSEEN = 'beams32'
+
+
+def methods() -> Methods:
+    """Return the methods, LCDNet with the weights that LCDNET_WEIGHTS names or that ship."""
+    named = os.environ.get('LCDNET_WEIGHTS')
+    return Methods(Path(named) if named else None, device=os.environ.get('LCDNET_DEVICE', 'auto'))
+
+
+def rendered(
+    work: Path,
+    kind: str,
+    seed: int,
+    *,
+    run: int = 0,
+    sensor: str = 'hdl64',
+    length_m: float | None = None,
+) -> StoredSweeps:
+    """Return the sweeps of a drive through a town, cast the first time and kept in `work`.
+
+    Args:
+        work: folder.
+        kind: of its revisits, same_way or reverse.
+        seed: of the town.
+        run: the same streets at another time.
+        sensor: LiDAR.
+        length_m: of the drive.
+    """
+    length = LENGTH_M if length_m is None else length_m
+    name = f'town_{seed}_{kind}_run{run}_{sensor}_{length:.0f}'
+    folder = work / 'sweeps' / name
+    if not is_stored(folder):
+        same_way, reverse = _SHARES[kind]
+        journey = JourneyConfig(length=length, same_way=same_way, reverse=reverse, lateral=1.5)
+        drive = SimulatedDrive(seed, run, journey, SensorsConfig(lidar=sensor, imu='', gnss=False))
+        drive.name = name
+        expected = int(length / _SPACING_M)
+        with terminal_bar(f'casting {name}', expected) as step:
+            store_drive(drive, folder, spacing_m=_SPACING_M, progress=lambda done, of: step())
+    return StoredSweeps(folder)
+
+
+def detection(work: Path, towns: int = 3) -> dict[str, Any]:
+    """Return average precision by protocol, class and method: means over towns, and each town's."""
+    found: dict[str, dict[str, Any]] = {}
+    for kind in _SHARES:
+        for seed in TEST_SEEDS[:towns]:
+            sweeps = rendered(work, kind, seed)
+            judged = study_detection(
+                methods(), METHODS, {'whole': sweeps}, RevisitConfig(),
+                folder=work / 'descriptors', bar=terminal_bar,
+            )['whole']  # fmt: skip
+            found.setdefault(kind, {})[f'town_{seed}'] = judged
+    figures: dict[str, Any] = {'ap': _average_precision(found)}
+    _add_map_closures(figures['ap'], found, work)
+    figures['detection_by_town'] = {
+        kind: {town: _plain(judged) for town, judged in by_town.items()}
+        for kind, by_town in found.items()
+    }
+    return figures
+
+
+def _add_map_closures(
+    figures: dict[str, Any], found: Mapping[str, Mapping[str, Any]], work: Path
+) -> None:
+    """Add MapClosures' means over towns to protocol 1, or why they are missing."""
+    for kind, by_town in found.items():
+        values = []
+        for town, of_town in by_town.items():
+            known = [one for one in of_town.values() if isinstance(one, JudgedMethod)]
+            if not known:
+                continue
+            sweeps = rendered(work, kind, int(town.removeprefix('town_')))
+            try:
+                curve = judge_map_closures(work, sweeps, known[0].detection.reverse, kind)
+            except (LocalizationError, OSError) as error:
+                figures.setdefault('missing', {})['map_closures'] = str(error)
+                continue
+            values.append(curve.average_precision)
+        if values:
+            figures['protocol1'][kind]['map_closures'] = float(np.mean(values))
+
+
+def changed(work: Path, length_m: float | None = None) -> dict[str, Any]:
+    """Return the same for a second run among other cars, and for a sensor not trained on."""
+    seed = TEST_SEEDS[0]
+    runs = [rendered(work, 'same_way', seed, run=run, length_m=length_m) for run in (0, 1)]
+    joined = Joined(runs, f'town_{seed}_runs_0_1_{len(runs[0])}_{len(runs[1])}')
+    # Only the second run asks, all of the first is its past.
+    traffic = study_detection(
+        methods(), METHODS, {'whole': joined}, RevisitConfig(first_scan=len(runs[0])),
+        folder=work / 'descriptors', bar=terminal_bar,
+    )['whole']  # fmt: skip
+    unseen = {}
+    for kind in _SHARES:
+        sweeps = rendered(work, kind, seed, sensor=_UNSEEN, length_m=length_m)
+        unseen[kind] = {
+            f'town_{seed}': study_detection(
+                methods(), METHODS, {'whole': sweeps}, RevisitConfig(),
+                folder=work / 'descriptors', bar=terminal_bar,
+            )['whole']
+        }  # fmt: skip
+    return {
+        'ap_other_traffic': _average_precision({'all': {f'town_{seed}': traffic}}),
+        f'ap_unseen_{_UNSEEN}': _average_precision(unseen),
+    }
+
+
+def sectors(work: Path, towns: int = 3, length_m: float | None = None) -> dict[str, Any]:
+    """Return average precision with sectors removed at random, and with the rear blocked."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for kind in _SHARES:
+        for seed in TEST_SEEDS[:towns]:
+            sweeps = rendered(work, kind, seed, length_m=length_m)
+            blocked = RearBlocked(sweeps)
+            views: dict[str, Sweeps] = {
+                'sector_45': SectorRemoved(sweeps, 45.0),
+                'sector_90': SectorRemoved(sweeps, 90.0),
+                'rear_70': blocked,
+                'rear_70_aggregated': Aggregated(blocked),
+            }
+            judged = study_detection(
+                methods(), METHODS, views, RevisitConfig(),
+                folder=work / 'descriptors', bar=terminal_bar,
+            )  # fmt: skip
+            for view, of_view in judged.items():
+                found.setdefault(view, {}).setdefault(kind, {})[f'town_{seed}'] = of_view
+    return {f'ap_{view}': _average_precision(by_kind) for view, by_kind in found.items()}
+
+
+def _average_precision(
+    found: Mapping[str, Mapping[str, Mapping[str, JudgedMethod | str]]],
+) -> dict[str, Any]:
+    """Return protocol -> class -> method -> mean over towns; `missing` tells what is not there."""
+    figures: dict[str, Any] = {'protocol1': {}, 'protocol2': {}}
+    missing: dict[str, str] = {}
+    for kind, by_town in found.items():
+        for protocol in (1, 2):
+            values: dict[str, list[float]] = {}
+            for judged in by_town.values():
+                for name, one in judged.items():
+                    if isinstance(one, str):
+                        missing[name] = one
+                        continue
+                    curve = getattr(one.detection, f'protocol_{protocol}')[kind]
+                    values.setdefault(name, []).append(curve.average_precision)
+            figures[f'protocol{protocol}'][kind] = {
+                name: float(np.mean(of_towns)) for name, of_towns in values.items()
+            }
+    if missing:
+        figures['missing'] = missing
+    return figures
+
+
+def _plain(judged: Mapping[str, JudgedMethod | str]) -> dict[str, Any]:
+    return {name: one.plain() for name, one in judged.items() if isinstance(one, JudgedMethod)}
