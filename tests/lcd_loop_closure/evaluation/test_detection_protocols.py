@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,17 @@ def test_too_short_a_drive_has_no_candidates() -> None:
     assert len(found.query) == 0
     curve = protocol_1(found)
     assert curve.average_precision == 0.0 and curve.loops == 0
+
+
+def test_a_scan_without_a_candidate_is_a_missed_loop_whatever_the_threshold() -> None:
+    positions, descriptors = noisy_drive(8.0)
+    found = candidates(
+        lambda i, m: np.linalg.norm(descriptors[:m] - descriptors[i], axis=1), positions, SETTINGS
+    )
+    without = np.arange(len(found)) % 3 == 0
+    distance = np.where(without, np.inf, found.distance)
+    curve = protocol_1(replace(found, distance=distance, right=found.right & ~without))
+    rejected = np.sum(found.loop & without)
+    right = np.sum(found.right & ~without)
+    assert curve.recall[-1] == pytest.approx(right / (right + rejected))
+    assert np.isfinite(curve.threshold).all()
