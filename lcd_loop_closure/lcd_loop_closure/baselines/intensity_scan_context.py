@@ -32,6 +32,9 @@ class IntensityScanContextConfig:
     turn_tolerance: int = setting(
         0, 'sectors around the turn of the best geometry in which intensities are compared', low=0
     )
+    max_distance: float = setting(
+        0.4, 'candidates that look less alike are not registered', low=0.0
+    )
     min_geometry: float = setting(
         0.0,
         'share of bins that must agree to be occupied or free; what agrees less is no candidate '
@@ -53,6 +56,11 @@ class IntensityScanContext:
 
     def __init__(self, settings: IntensityScanContextConfig | None = None) -> None:
         self.settings = settings or IntensityScanContextConfig()
+
+    @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+        return self.settings.max_distance
 
     @property
     def length(self) -> int:
@@ -88,6 +96,9 @@ class IntensityScanContext:
         share = np.clip(cloud.intensity[keep] / s.full_intensity, 0.0, 1.0)
         np.maximum.at(bins, ring * s.sectors + sector, share.astype(np.float32))
         return bins
+
+    def features(self, cloud: PointCloud) -> None:
+        """Return None: there are no keypoints to register by."""
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what has to be stored of a descriptor; raises DataError on another length."""

@@ -35,6 +35,9 @@ class LidarIrisConfig:
     wavelength: float = setting(18.0, 'of the first filter, in sectors', low=2.0)
     growth: float = setting(1.6, 'of the wavelength from filter to filter', low=1.0)
     bandwidth: float = setting(0.75, 'sigma of a filter over its frequency', low=0.1, high=0.99)
+    max_distance: float = setting(
+        0.4, 'candidates that look less alike are not registered', low=0.0
+    )
     peaks: int = setting(
         2,
         'turns that are tried, the best of a correlation of phases; 0: all turns, whose best these '
@@ -74,6 +77,11 @@ class LidarIris:
         self._frequencies = min(s.frequencies, s.sectors // 2)
 
     @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+        return self.settings.max_distance
+
+    @property
     def length(self) -> int:
         """Numbers in a descriptor: the pixels."""
         return self.settings.rings * self.settings.sectors
@@ -96,6 +104,9 @@ class LidarIris:
         inside = ring < s.rings
         seen[ring[inside], sector[inside], height[inside]] = True
         return np.packbits(seen, axis=2, bitorder='little').astype(np.float32).ravel()
+
+    def features(self, cloud: PointCloud) -> None:
+        """Return None: there are no keypoints to register by."""
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what has to be stored of a descriptor; raises DataError on another length."""

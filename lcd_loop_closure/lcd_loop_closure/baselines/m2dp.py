@@ -22,6 +22,9 @@ class M2dpConfig:
     )
     circles: int = setting(8, 'circles on a plane, l in the paper', low=1, high=64)
     sectors: int = setting(16, 'sectors on a plane, t in the paper', low=2, high=128)
+    max_distance: float = setting(
+        0.3, 'candidates that look less alike are not registered', low=0.0
+    )
     axis_signs: str = setting(
         'skewness',
         'what turns the principal axes to one of their two ends: the longer tail of the points '
@@ -48,6 +51,11 @@ class M2dp:
             np.linspace(-np.pi / 2, np.pi / 2, s.azimuths), np.linspace(0, np.pi / 2, s.elevations)
         )
         self._metric = Euclidean(self.length)
+
+    @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+        return self.settings.max_distance
 
     @property
     def length(self) -> int:
@@ -87,6 +95,9 @@ class M2dp:
             counts = np.bincount(circle * s.sectors + sector, minlength=shares.shape[1])
             shares[plane] = counts / len(xyz)
         return shares
+
+    def features(self, cloud: PointCloud) -> None:
+        """Return None: there are no keypoints to register by."""
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the descriptor; raises DataError on another length."""
