@@ -11,16 +11,14 @@ sys.path.append(str(Path(__file__).parents[1]))
 @pytest.fixture(scope='session')
 def street_views():
     """Two pairs (match, query) of sweeps up to 4 m apart: the same way and the other way."""
-    from simulated_street import pairs_apart, relative, view
+    from simulated_street import pairs_apart, street, view
 
     from lcd_common import se3
 
+    poses = street().truth().T_world_body
     found = {}
     for i, j in pairs_apart(1.0, 4.0):
-        match, query = view(i), view(j)
-        yaw = abs(se3.yaw(relative(match, query)))
+        yaw = abs(se3.yaw(se3.inverse(poses[i]) @ poses[j]))
         if yaw < 0.2 or yaw > 2.9:
-            found.setdefault(yaw > 2.9, (match, query))
-        if len(found) == 2:
-            break
-    return [found[False], found[True]]
+            found.setdefault(yaw > 2.9, (i, j))
+    return [tuple(view(index) for index in found[reverse]) for reverse in (False, True)]
