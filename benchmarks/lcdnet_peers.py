@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.loop_pairs import T_BASE_LIDAR
-from benchmarks.map_closures import judged, map_closures
+from benchmarks.peer_candidates import judged, map_closures
 from lcd_common import se3
 from lcd_loop_closure.evaluation.detection_protocols import PrecisionRecall, protocol_1
 from lcd_loop_closure.evaluation.sweep_store import StoredSweeps
