@@ -95,7 +95,9 @@ def judged(
 ) -> Candidates:
     """Return the candidate of each scan, its distance minus the inliers, for `protocol_1`.
 
-    A scan takes the closure of the last map before it. The candidate is not that map's own scan but
+    A scan takes the closure of the last map before it, which counts up to half an inlier less the
+    longer ago that was: equal distances would be accepted together, and protocol 1 leaves the first
+    ones accepted out of the average. The candidate is not that map's own scan but
     the one nearest to where the closure puts the query, on the path around the older map: maps
     overlap over tens of metres, scans of one place must lie within four. Without a closure the
     distance is infinite, which protocol 1 never accepts.
@@ -118,7 +120,8 @@ def judged(
             T_map_query = se3.inverse(T_world_lidar[run.scan[of_map]]) @ T_world_lidar[query]
             T_world_query = T_world_lidar[closure.match] @ closure.T_match_query @ T_map_query
             candidate = _nearest_on_path(positions[:earlier], closure.match, T_world_query[:3, 3])
-            distance = -float(closure.inliers)
+            since = (query - run.scan[of_map]) / max(int(np.diff(run.scan).max(initial=1)), 1)
+            distance = -float(closure.inliers) + 0.5 * min(float(since), 1.0)
         near = away <= s.distance
         right = bool(near[candidate]) and bool(np.isfinite(distance))
         rows.append((query, candidate, distance, right, bool(near.any())))
