@@ -141,7 +141,7 @@ def _study(
     if not arguments.registration:
         return study
     if arguments.freiburg:
-        study.pairs['icp_10'] = _confirmed_pairs(arguments, sweeps, bar)
+        study.pairs['icp'] = _confirmed_pairs(arguments, sweeps, bar)
     else:
         for band in bands:
             study.pairs[band.name] = choose_pairs(

@@ -66,7 +66,7 @@ def _curves(judged: dict[str, JudgedMethod], view: str, folder: Path) -> Picture
                 ax.set_title(f'Protocol {row}, {_TITLES[kind]} ({loops} {counted})')
     return Picture(
         path,
-        f'Precision and recall: {_view(view)}',
+        f'Precision and recall: {view_title(view)}',
         'Protocol 1 judges the most similar earlier scan of each scan, protocol 2 every pair.',
     )
 
@@ -89,7 +89,7 @@ def _maps(
             ax.set_axis_off()
     return Picture(
         path,
-        f'True, false and missed detections: {_view(view)}',
+        f'True, false and missed detections: {view_title(view)}',
         'Each method at the threshold of its largest F1 score by protocol 1 (Figure 3.7).',
     )
 
@@ -105,14 +105,28 @@ def _errors(errors: dict[str, RegistrationErrors], kind: str, folder: Path) -> P
             axes[0, 0].legend(loc='lower right', fontsize=8)
     return Picture(
         path,
-        f'Registration errors: {kind.replace("_", " ")} m apart',
+        f'Registration errors: pairs {pairs_title(kind)}',
         'Above, the share of pairs that are off by no more; the dotted line is the limit of '
         'success. Below, how the small errors are distributed.',
     )
 
 
-def _view(view: str) -> str:
-    return 'whole sweeps' if view == 'whole' else view.replace('_', ' ')
+def view_title(view: str) -> str:
+    """Return what people call a view of the sweeps."""
+    if view == 'whole':
+        return 'whole sweeps'
+    kind, width, *more = view.split('_')
+    title = f'{width}° {"to the rear" if kind == "rear" else "at random"} removed'
+    return f'{title}, with the metres before' if more else title
+
+
+def pairs_title(kind: str) -> str:
+    """Return what people call a kind of pairs, e.g. 0_4 or 0_4_sector_90."""
+    if kind.startswith('icp'):
+        return 'confirmed by ICP'
+    low, high, *view = kind.split('_', 2)
+    title = f'{low} to {high} m apart'
+    return f'{title}, {view_title(view[0])}' if view else title
 
 
 @contextmanager

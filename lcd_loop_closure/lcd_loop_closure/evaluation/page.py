@@ -7,7 +7,7 @@ from typing import Any
 
 import jinja2
 
-from lcd_loop_closure.evaluation.figures import Picture
+from lcd_loop_closure.evaluation.figures import Picture, pairs_title, view_title
 
 _TEMPLATE = Path(__file__).with_name('page.html')
 _CLASSES = (('all', 'all'), ('same_way', 'same way'), ('reverse', 'reverse'))
@@ -77,10 +77,9 @@ def detection_tables(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             best = (one['protocol_1']['all'] or {}).get('f1_max')
             cells += [_number(best), _number(one['recall_1']), _number(one['describe_ms'], 1)]
             rows.append(cells)
-        whole = 'whole sweeps' if view == 'whole' else view.replace('_', ' ')
         tables.append(
             {
-                'title': f'Loop detection: {whole}',
+                'title': f'Loop detection: {view_title(view)}',
                 'columns': columns,
                 'rows': rows,
                 'missing': missing,
@@ -119,7 +118,7 @@ def registration_tables(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             )
         tables.append(
             {
-                'title': f'Registration: {result["pairs"]} pairs, {kind.replace("_", " ")} m apart '
+                'title': f'Registration: {result["pairs"]} pairs {pairs_title(kind)} '
                 f'(of {result["pairs_to_draw_from"]})',
                 'columns': columns,
                 'rows': rows,

@@ -58,9 +58,7 @@ class World:
         T = self.T_world_base[number]
         near = np.linalg.norm(self._points[:, :2] - T[:2, 3], axis=1) < 35.0
         xyz = se3.transform_points(se3.inverse(T), self._points[near])
-        return PointCloud(
-            xyz.astype(np.float32), self._shine[near] if self._intensity else None
-        )
+        return PointCloud(xyz.astype(np.float32), self._shine[near] if self._intensity else None)
 
 
 def out_and_back(length_m: float = 90.0, step_m: float = 3.0) -> np.ndarray:
