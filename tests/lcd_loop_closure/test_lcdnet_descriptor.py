@@ -141,7 +141,7 @@ def test_missing_and_wrong_weights_are_one_line(tmp_path, monkeypatch):
         LcdnetDescriptor(LcdnetDescriptorConfig(weights=str(tmp_path / 'gone')))
     wrong = tmp_path / 'wrong.safetensors'
     wrong.write_text('not weights')
-    with pytest.raises(DataError, match='best.safetensors') as other:
+    with pytest.raises(DataError, match=r'best\.safetensors') as other:
         LcdnetDescriptor(LcdnetDescriptorConfig(weights=str(wrong)))
     assert '\n' not in str(other.value)
 

@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from evaluation_samples import World, out_and_back, tiny_weights
 
 from bags.drives import open_drive
-from evaluation_samples import World, out_and_back, tiny_weights
 from lcd_common import se3
 from lcd_loop_closure.evaluation.detection import judge_descriptor
 from lcd_loop_closure.evaluation.drive_sweeps import spaced, store_drive

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from evaluation_samples import World, out_and_back
+
 from lcd_common import se3
 from lcd_loop_closure.evaluation.icp_pairs import IcpPairsConfig, drawn_pairs, icp_pairs
 from lcd_loop_closure.evaluation.initial_guess import compare_guess

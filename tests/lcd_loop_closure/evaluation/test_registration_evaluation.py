@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from evaluation_samples import World, out_and_back
+
 from lcd_common import se3
 from lcd_common.errors import DataError
 from lcd_loop_closure.evaluation.proportion import Proportion

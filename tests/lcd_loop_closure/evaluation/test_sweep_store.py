@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-
 from evaluation_samples import World, out_and_back
+
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 from lcd_loop_closure.evaluation.sweep_store import (
@@ -60,9 +60,13 @@ def test_no_intensity_empty_and_broken_points(tmp_path):
 
 
 def test_what_was_not_finished_does_not_count(tmp_path):
-    with pytest.raises(RuntimeError), SweepWriter(tmp_path, 'half') as writer:
-        writer.add(1, PointCloud(np.ones((4, 3), np.float32)), np.eye(4))
-        raise RuntimeError('power cut')
+    def interrupted() -> None:
+        with SweepWriter(tmp_path, 'half') as writer:
+            writer.add(1, PointCloud(np.ones((4, 3), np.float32)), np.eye(4))
+            raise RuntimeError('power cut')
+
+    with pytest.raises(RuntimeError):
+        interrupted()
     assert not is_stored(tmp_path)
     with pytest.raises(DataError, match='no complete set of sweeps'):
         StoredSweeps(tmp_path)

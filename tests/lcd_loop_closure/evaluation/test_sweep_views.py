@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-
 from evaluation_samples import World, out_and_back
+
 from lcd_common.cloud import PointCloud
 from lcd_loop_closure.evaluation.sweep_views import (
     Aggregated,
