@@ -228,7 +228,7 @@ def _parser() -> argparse.ArgumentParser:
     defaults = RevisitConfig()
     add('--out', type=Path, required=True, metavar='FOLDER', help='for the results')
     add('--methods', nargs='*', default=['lcdnet', 'scan_context'], metavar='NAME',
-        choices=DESCRIPTORS, help='descriptors to judge (default: lcdnet scan_context)')  # fmt: skip
+        choices=DESCRIPTORS, help='descriptors (default: lcdnet scan_context)')  # fmt: skip
     add('--registration', nargs='*', default=[], metavar='NAME', choices=REGISTRATIONS,
         help='registrations to judge (default: none)')  # fmt: skip
     add('--weights', type=Path, metavar='FILE', help='of LCDNet (default: those that ship)')
