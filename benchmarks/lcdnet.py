@@ -42,6 +42,8 @@ REQUIRED = (
     'real.kitti_00.pair_rotation_error_deg',
     'real.kitti_00.negatives_rejected',
     'real.out_and_back.*',
+    'loops_of_the_nodes.out_and_back.lcdnet.true',
+    'loops_of_the_nodes.demonstration.lcdnet.true',
     'descriptor_ms.compact_cpu',
     'descriptor_ms.full_cpu',
     'descriptor_ms.full_gpu',
@@ -55,7 +57,13 @@ REQUIRED = (
 def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
     """Return every section by name: what it measures, and the function that does."""
     # Imported here: --help and --list need none of it.
-    from benchmarks import lcdnet_drives, lcdnet_real, lcdnet_registration, lcdnet_speed
+    from benchmarks import (
+        lcdnet_drives,
+        lcdnet_loops,
+        lcdnet_real,
+        lcdnet_registration,
+        lcdnet_speed,
+    )
 
     towns, pairs = (1, 60) if quick else (3, 1002)
     return {
@@ -82,6 +90,10 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         'real': (
             'real sweeps: a pair from any yaw, negatives, the out-and-back drive, neighbours',
             partial(lcdnet_real.evaluate, sweep_step=10 if quick else 1),
+        ),
+        'loops': (
+            'loops that the nodes accept, LCDNet beside Scan Context',
+            lcdnet_loops.evaluate,
         ),
         'speed': ('times by stage, and how they grow', lcdnet_speed.evaluate),
     }
