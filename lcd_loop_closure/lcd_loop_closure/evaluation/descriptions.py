@@ -57,8 +57,9 @@ def describe_sweeps(
     number = len(sweeps.T_world_base)
     path = None
     if folder is not None:
-        identity = hashlib.sha256(f'{key}|{number}'.encode()).hexdigest()[:12]
-        path = folder / f'{sweeps.name}-{descriptor.name}-{identity}.npz'
+        # Drives of one name differ by where they went.
+        identity = hashlib.sha256(f'{key}|'.encode() + sweeps.T_world_base.tobytes()).hexdigest()
+        path = folder / f'{sweeps.name}-{descriptor.name}-{identity[:12]}.npz'
         if path.is_file():
             with np.load(path) as kept:
                 return Descriptions(kept['rows'], kept['describe_ms'])

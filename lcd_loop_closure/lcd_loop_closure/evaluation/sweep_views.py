@@ -39,7 +39,7 @@ class SectorRemoved:
         self._sweeps, self._width = sweeps, np.radians(width_deg)
         rng = np.random.default_rng([seed, 29])
         self._middle = rng.uniform(-np.pi, np.pi, len(sweeps.T_world_base))
-        self.name = f'{sweeps.name}_sector_{width_deg:g}'
+        self.name = f'{sweeps.name}_sector_{width_deg:g}_draw_{seed}'
         self.T_world_base = sweeps.T_world_base
 
     def cloud(self, number: int) -> PointCloud:
