@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
+from lcd_loop_closure.local_features import LocalFeatures
 
 
 class Metric(Protocol):
@@ -36,11 +37,18 @@ class PlaceDescriptor(Metric, Protocol):
     name: str
 
     @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+
+    @property
     def length(self) -> int:
         """Numbers in a descriptor."""
 
     def describe(self, cloud: PointCloud) -> NDArray[np.float32]:
         """Return the descriptor [length] float32 of a sweep in the base frame."""
+
+    def features(self, cloud: PointCloud) -> LocalFeatures | None:
+        """Return keypoints that register a sweep; None where the descriptor has none."""
 
 
 class Euclidean:

@@ -7,6 +7,7 @@ from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.stamp_buffer import StampedPose
 from lcd_loop_closure.keyframes import Keyframe
+from lcd_loop_closure.local_features import LocalFeatures
 
 
 class KeyframeBuilder:
@@ -27,6 +28,7 @@ class KeyframeBuilder:
         cloud: PointCloud,
         descriptor: NDArray[np.float32] | None,
         descriptor_method: str,
+        features: LocalFeatures | None = None,
     ) -> Keyframe:
         """Make the next keyframe of the chain from odometry at its stamp and its reduced cloud."""
         T_previous_this, covariance = self._motion(pose)
@@ -39,6 +41,7 @@ class KeyframeBuilder:
             cloud=cloud,
             descriptor=descriptor,
             descriptor_method=descriptor_method,
+            features=features,
         )
         self.next_id += 1
         self._last = pose

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.settings import config, setting
+from lcd_loop_closure.local_features import LocalFeatures
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class Keyframe:
         cloud: reduced cloud in the base frame.
         descriptor: flattened float32, or None.
         descriptor_method: name of the descriptor; empty when there is none.
+        features: keypoints that register it; None where the descriptor has none, or they are not
+            at hand (they do not travel in messages and maps).
     """
 
     id: int
@@ -33,6 +36,7 @@ class Keyframe:
     cloud: PointCloud
     descriptor: NDArray[np.float32] | None = None
     descriptor_method: str = ''
+    features: LocalFeatures | None = None
 
 
 @config

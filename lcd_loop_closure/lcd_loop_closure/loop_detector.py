@@ -10,10 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
+from lcd_common.errors import DataError
 from lcd_common.settings import config, setting
 from lcd_loop_closure.bev_registration import BevConfig
-from lcd_loop_closure.descriptor_index import DescriptorIndex
+from lcd_loop_closure.descriptor_choice import DescriptorConfig, make_descriptor
+from lcd_loop_closure.descriptor_index import DescriptorIndex, PlaceDescriptor
+from lcd_loop_closure.feature_registration import FeatureRegistrationConfig
 from lcd_loop_closure.keyframes import Keyframe
+from lcd_loop_closure.lcdnet_settings import LcdnetDescriptorConfig
+from lcd_loop_closure.local_features import LocalFeatures
 from lcd_loop_closure.loop import LoopConstraint, LoopStatus
 from lcd_loop_closure.odometry_reach import OdometryReach
 from lcd_loop_closure.pair_registration import (
@@ -26,7 +31,7 @@ from lcd_loop_closure.pair_registration import (
 from lcd_loop_closure.radius_search import GraphPositions, RadiusSearch, RadiusSearchConfig
 from lcd_loop_closure.reduction import ReductionConfig, reduce_cloud
 from lcd_loop_closure.refinement import RefinementConfig
-from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
+from lcd_loop_closure.scan_context import ScanContextConfig
 from lcd_loop_closure.verification import VerificationConfig
 
 Gate = Callable[[Keyframe, Keyframe], str | None]
@@ -39,9 +44,6 @@ class LoopDetectorConfig:
     by_descriptor: bool = setting(True, 'search the descriptors of all keyframes')
     by_radius: bool = setting(True, 'search around the current estimate of the pose graph')
     max_candidates: int = setting(3, 'candidates registered for one keyframe', low=1, high=50)
-    max_descriptor_distance: float = setting(
-        0.5, 'candidates that look less alike are not registered', low=0.0
-    )
     delay: float = setting(
         30.0, 'keyframes met within this distance of travel are no loop candidates', unit='m', low=0
     )
@@ -67,9 +69,12 @@ class LoopDetectorSettings:
 
     detector: LoopDetectorConfig = field(default_factory=LoopDetectorConfig)
     reduction: ReductionConfig = field(default_factory=ReductionConfig)
-    descriptor: ScanContextConfig = field(default_factory=ScanContextConfig)
+    descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
+    lcdnet: LcdnetDescriptorConfig = field(default_factory=LcdnetDescriptorConfig)
+    scan_context: ScanContextConfig = field(default_factory=ScanContextConfig)
     radius: RadiusSearchConfig = field(default_factory=RadiusSearchConfig)
     pair: PairConfig = field(default_factory=PairConfig)
+    features: FeatureRegistrationConfig = field(default_factory=FeatureRegistrationConfig)
     registration: BevConfig = field(default_factory=BevConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
@@ -90,12 +95,11 @@ class LoopDetector:
     the same order give the same constraints.
     """
 
-    descriptor_method = ScanContext.name
-
     def __init__(
         self,
         settings: LoopDetectorSettings | None = None,
         *,
+        descriptor: PlaceDescriptor | None = None,
         sensor_origin: NDArray[np.float64] | None = None,
         timer: Timer | None = None,
         gate: Gate | None = None,
@@ -104,6 +108,7 @@ class LoopDetector:
 
         Args:
             settings: of all stages.
+            descriptor: what tells places apart; None: made as the settings say.
             sensor_origin: [3] position of the LiDAR in the base frame, metres; None: 1.73 m above
                 base_link, as on KITTI's car.
             timer: `timer(stage)` is entered around each of the stages describe, retrieve,
@@ -115,7 +120,8 @@ class LoopDetector:
         s = self.settings
         self._timer = timer or (lambda stage: nullcontext())
         self._gate = gate
-        self._descriptor = ScanContext(s.descriptor)
+        self._descriptor = descriptor or make_descriptor(s.descriptor, s.lcdnet, s.scan_context)
+        self.descriptor_method = self._descriptor.name
         self._index = DescriptorIndex(self._descriptor, s.detector.delay)
         self._radius = RadiusSearch(s.radius)
         self._pairs = PairRegistration(
@@ -123,6 +129,7 @@ class LoopDetector:
             s.registration,
             s.refinement,
             s.verification,
+            s.features,
             sensor_origin=sensor_origin,
             timer=timer,
         )
@@ -152,6 +159,7 @@ class LoopDetector:
             keyframe.cloud.xyz.nbytes
             + (0 if keyframe.cloud.intensity is None else keyframe.cloud.intensity.nbytes)
             + (0 if keyframe.descriptor is None else keyframe.descriptor.nbytes)
+            + (0 if keyframe.features is None else keyframe.features.nbytes)
             + 4 * self._descriptor.row_length
             for keyframe in self._keyframes.values()
         )
@@ -173,7 +181,10 @@ class LoopDetector:
         cloud.
         """
         for keyframe in keyframes:
-            self._remember(self._arrive(keyframe), restored=True)
+            try:
+                self._remember(self._arrive(keyframe), restored=True)
+            except DataError:
+                continue  # too few points to tell the place: no candidate
 
     def forget(self, id: int) -> None:
         """Forget one keyframe; an unknown id is no error."""
@@ -215,7 +226,8 @@ class LoopDetector:
     def compare(self, match: Keyframe, query: Keyframe) -> LoopConstraint:
         """Register and verify one pair of keyframes, whatever retrieval says of them."""
         pair = self._pairs.compare(
-            self._pairs.prepare(match.cloud.xyz), self._pairs.prepare(query.cloud.xyz)
+            self._pairs.prepare(match.cloud.xyz, self._features(match)),
+            self._pairs.prepare(query.cloud.xyz, self._features(query)),
         )
         return _constraint(match, query, _Candidate(match.id, 'pair'), pair)
 
@@ -294,7 +306,7 @@ class LoopDetector:
             if rejection is not None:
                 loops.append(_constraint(match, query, candidate, rejection))
                 continue
-            prepared = prepared or self._pairs.prepare(query.cloud.xyz)
+            prepared = prepared or self._pairs.prepare(query.cloud.xyz, self._features(query))
             pair = self._pairs.compare(self._prepared(match), prepared)
             loops.append(_constraint(match, query, candidate, pair))
             if pair.status is LoopStatus.ACCEPTED:
@@ -303,7 +315,7 @@ class LoopDetector:
 
     def _screen(self, query: Keyframe, match: Keyframe, candidate: _Candidate) -> PairResult | None:
         """Reject a candidate before the expensive stages, or return None."""
-        limit = self.settings.detector.max_descriptor_distance
+        limit = self._descriptor.max_distance
         distance = candidate.descriptor_distance
         if distance is not None and distance > limit:
             reason = f'descriptor distance {distance:.2f} exceeds {limit:g}'
@@ -311,8 +323,16 @@ class LoopDetector:
         veto = self._gate(query, match) if self._gate else None
         return None if veto is None else PairResult(LoopStatus.REJECTED_UNCERTAIN, veto)
 
+    def _features(self, keyframe: Keyframe) -> LocalFeatures | None:
+        """Return what registers a keyframe; of a loaded one made from its reduced cloud."""
+        if keyframe.features is None and len(keyframe.cloud):
+            return self._descriptor.features(keyframe.cloud)
+        return keyframe.features
+
     def _prepared(self, keyframe: Keyframe) -> PreparedCloud:
-        prepared = self._ready.pop(keyframe.id, None) or self._pairs.prepare(keyframe.cloud.xyz)
+        prepared = self._ready.pop(keyframe.id, None) or self._pairs.prepare(
+            keyframe.cloud.xyz, self._features(keyframe)
+        )
         self._ready[keyframe.id] = prepared
         while len(self._ready) > self.settings.detector.cached_clouds:
             self._ready.popitem(last=False)
@@ -335,7 +355,7 @@ def _constraint(
         rmse_m=None if verdict is None else verdict.rmse_m,
         inliers=0 if verdict is None else verdict.inliers,
         overlap=None if verdict is None else verdict.overlap,
-        method=f'{candidate.found_by}+{PairRegistration.method}',
+        method=f'{candidate.found_by}+{pair.method}',
         status=pair.status,
         reason=pair.reason,
     )

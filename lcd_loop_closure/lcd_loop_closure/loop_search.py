@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
 from lcd_common.stamp_buffer import StampedPose
+from lcd_loop_closure.descriptor_choice import make_descriptor
 from lcd_loop_closure.keyframe_builder import KeyframeBuilder
 from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint
@@ -14,7 +15,6 @@ from lcd_loop_closure.loop_detector import LoopDetector, LoopDetectorSettings
 from lcd_loop_closure.pair_registration import Timer
 from lcd_loop_closure.radius_search import GraphPositions
 from lcd_loop_closure.reduction import reduce_cloud
-from lcd_loop_closure.scan_context import ScanContext
 
 
 class Session:
@@ -55,7 +55,9 @@ class LoopSearch:
 
     def __init__(self, settings: LoopDetectorSettings, timer: Timer) -> None:
         self._settings, self._timer = settings, timer
-        self._descriptor = ScanContext(settings.descriptor)
+        self._descriptor = make_descriptor(
+            settings.descriptor, settings.lcdnet, settings.scan_context
+        )
         self._session: Session | None = None
         self._detector: LoopDetector | None = None
 
@@ -68,6 +70,9 @@ class LoopSearch:
         """Reduce and describe a sweep (base frame) and make it the session's next keyframe.
 
         None when no point is left. May be called on another thread than `run`.
+
+        Raises:
+            DataError: too few points are left to tell the place.
         """
         with self._timer('reduce'):
             reduced = reduce_cloud(cloud, self._settings.reduction)
@@ -75,14 +80,19 @@ class LoopSearch:
             return None
         with self._timer('describe'):
             descriptor = self._descriptor.describe(cloud)
-        return session.builder.build(pose, reduced, descriptor, ScanContext.name)
+            features = self._descriptor.features(cloud)
+        name = self._descriptor.name
+        return session.builder.build(pose, reduced, descriptor, name, features)
 
     def run(self, job: SearchJob) -> list[LoopConstraint]:
         """Return every candidate that was tried for the keyframe, with its verdict."""
         if self._detector is None or job.session is not self._session:
             self._session = job.session
             self._detector = LoopDetector(
-                self._settings, sensor_origin=job.sensor_origin, timer=self._timer
+                self._settings,
+                descriptor=self._descriptor,
+                sensor_origin=job.sensor_origin,
+                timer=self._timer,
             )
             self._detector.restore(job.session.loaded)
         if not job.search:

@@ -26,6 +26,9 @@ class ScanContextConfig:
     height_offset: float = setting(
         0.27, 'added to heights above base_link so that the ground counts as positive', unit='m'
     )
+    max_distance: float = setting(
+        0.5, 'candidates that look less alike are not registered', low=0.0
+    )
     shortlist: int = setting(
         0, 'compare only the keyframes with the nearest ring keys, as the paper does; 0: all', low=0
     )
@@ -42,6 +45,11 @@ class ScanContext:
 
     def __init__(self, settings: ScanContextConfig | None = None) -> None:
         self.settings = settings or ScanContextConfig()
+
+    @property
+    def max_distance(self) -> float:
+        """Descriptors farther apart are of different places."""
+        return self.settings.max_distance
 
     @property
     def length(self) -> int:
@@ -72,6 +80,9 @@ class ScanContext:
         at = np.minimum(ring, s.rings - 1) * s.sectors + sector
         np.maximum.at(bins, at, (z + s.height_offset).astype(np.float32))
         return bins
+
+    def features(self, cloud: PointCloud) -> None:
+        """Return None: heights in bins hold no keypoints."""
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what has to be stored of a descriptor; raises DataError on another length."""

@@ -5,6 +5,7 @@ import pytest
 from simulated_street import relative, street, view
 
 from lcd_common import se3
+from lcd_loop_closure.descriptor_choice import DescriptorConfig
 from lcd_loop_closure.keyframes import Keyframe, KeyframeConfig, KeyframeSelector
 from lcd_loop_closure.loop import LoopStatus
 from lcd_loop_closure.loop_detector import (
@@ -13,6 +14,7 @@ from lcd_loop_closure.loop_detector import (
     LoopDetectorSettings,
 )
 from lcd_loop_closure.radius_search import GraphPositions
+from lcd_loop_closure.scan_context import ScanContextConfig
 
 SWEEPS = {}
 
@@ -43,13 +45,18 @@ def drive(detector, every_m=8.0):
     return keyframes
 
 
-def settings(**values):
-    return LoopDetectorSettings(detector=LoopDetectorConfig(**values))
+def settings(max_distance=0.5, **values):
+    """Scan Context's: these tests are of the stages, whatever describes."""
+    return LoopDetectorSettings(
+        detector=LoopDetectorConfig(**values),
+        descriptor=DescriptorConfig(method='scan_context'),
+        scan_context=ScanContextConfig(max_distance=max_distance),
+    )
 
 
 @pytest.fixture(scope='module')
 def keyframes():
-    return drive(LoopDetector())
+    return drive(LoopDetector(settings()))
 
 
 @pytest.fixture(scope='module')
@@ -123,7 +130,7 @@ def test_radius_alone_finds_them_by_odometry_and_by_the_graph(keyframes):
 
 
 def test_descriptors_that_differ_too_much_are_not_registered(keyframes):
-    detector = LoopDetector(settings(by_radius=False, max_descriptor_distance=0.0))
+    detector = LoopDetector(settings(by_radius=False, max_distance=0.0))
     loops = [loop for keyframe in keyframes[:30] for loop in detector.process(keyframe)]
     assert loops
     assert {loop.status for loop in loops} == {LoopStatus.REJECTED_DESCRIPTOR}
@@ -137,7 +144,7 @@ def test_a_gate_vetoes_with_its_own_reason(keyframes):
         asked.append((query.id, match.id))
         return 'too uncertain: 0.9 exceeds 0.5'
 
-    detector = LoopDetector(settings(max_descriptor_distance=2.0), gate=gate)
+    detector = LoopDetector(settings(max_distance=2.0), gate=gate)
     loops = [loop for keyframe in keyframes[:30] for loop in detector.process(keyframe)]
     assert [(loop.query_id, loop.match_id) for loop in loops] == asked
     assert {loop.status for loop in loops} == {LoopStatus.REJECTED_UNCERTAIN}
@@ -145,7 +152,7 @@ def test_a_gate_vetoes_with_its_own_reason(keyframes):
 
 
 def test_a_loaded_map_is_searched_at_once(keyframes):
-    detector = LoopDetector()
+    detector = LoopDetector(settings())
     detector.restore(keyframes[:-1])
     assert detector.size == len(keyframes) - 1
     last = keyframes[-1]
@@ -184,7 +191,7 @@ def test_the_same_drive_gives_the_same_loops(keyframes, by_descriptor):
 
 
 def test_descriptors_that_do_not_fit_are_made_anew(keyframes):
-    detector = LoopDetector()
+    detector = LoopDetector(settings())
     other = keyframes[0]
     for descriptor, method in ((None, ''), (np.ones(256, np.float32), 'lcdnet')):
         changed = Keyframe(
@@ -203,7 +210,7 @@ def test_stages_are_timed_and_memory_is_stated(keyframes):
         stages.append(stage)
         yield
 
-    detector = LoopDetector(timer=timer)
+    detector = LoopDetector(settings(), timer=timer)
     detector.describe(keyframes[0].cloud)
     for keyframe in keyframes[-20:]:
         detector.process(keyframe)
@@ -215,6 +222,6 @@ def test_stages_are_timed_and_memory_is_stated(keyframes):
 
 def test_a_pair_can_be_asked_for_by_hand(keyframes, by_descriptor):
     found = next(iter(accepted(by_descriptor).values()))
-    loop = LoopDetector().compare(keyframes[found.match_id], keyframes[found.query_id])
+    loop = LoopDetector(settings()).compare(keyframes[found.match_id], keyframes[found.query_id])
     assert loop.accepted and loop.method == 'pair+bev+gicp'
     assert np.array_equal(loop.T_match_query, found.T_match_query)

@@ -83,6 +83,11 @@ def test_the_cloud_is_in_the_base_frame_and_described(make: Make) -> None:
     distance = np.linalg.norm(made.cloud.xyz[:, None] - whole.xyz[None], axis=2).min(axis=1)
     assert 100 < len(made.cloud) < len(whole)
     assert distance.max() < 1e-4  # measured points, not means
+    assert made.descriptor_method == 'lcdnet'
+    assert np.linalg.norm(made.descriptor) == pytest.approx(1.0, abs=1e-5)
+    fed = Fed(make(LoopClosureNode, threaded=False, descriptor__method='scan_context'))
+    fed.step(0)
+    made = keyframe_from_message(fed.keyframes[0])
     assert made.descriptor_method == 'scan_context'
     np.testing.assert_array_equal(made.descriptor, ScanContext().describe(whole))
 

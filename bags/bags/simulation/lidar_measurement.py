@@ -117,11 +117,11 @@ def beam_directions(model: LidarModel, seed: int) -> NDArray[np.float32]:
     """Return where the beams of one sensor really point [C x B x 3], lidar frame.
 
     Its points are computed with the directions of the model, as by a calibration that is not
-    perfect: KITTI's HDL-64E is known for elevations off by 0.2 degrees. The 0.03 degrees here are a
-    judgement.
+    perfect.
     """
     rng = np.random.default_rng([seed, 62])
     up, left = rng.normal(0.0, model.angle_sigma_rad, (2, len(model.elevation_rad)))
+    up = up + model.elevation_bias_rad
     azimuth = model.azimuth_rad()[:, None] + left
     level = np.cos(model.elevation_rad + up)
     z = np.broadcast_to(np.sin(model.elevation_rad + up), azimuth.shape)

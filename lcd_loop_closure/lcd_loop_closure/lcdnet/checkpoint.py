@@ -67,7 +67,7 @@ def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Lcdnet
     try:
         given: dict[str, Any] = stored.facts['config']
         settings = LcdnetConfig(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}  # type: ignore[arg-type]
         )
         network = Lcdnet(settings)
         network.load_state_dict(

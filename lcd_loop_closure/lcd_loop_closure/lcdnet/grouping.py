@@ -46,6 +46,7 @@ def ball_query(
             torch.zeros(shape, dtype=torch.long, device=centres.device),
             torch.zeros(shape, dtype=torch.bool, device=centres.device),
         )
+    points, centres = points.detach().float(), centres.detach().float()
     search = _by_tree if centres.device.type == 'cpu' else _by_distances
     index, found = search(points, centres, radius_m, wide, points_batch, centres_batch)
     chosen = _spread(found, count, generator)
@@ -80,12 +81,12 @@ def _by_tree(
 ) -> tuple[Tensor, Tensor]:
     far = np.array([0.0, 0.0, _APART_M])
     tree = cKDTree(
-        points.detach().numpy() + in_points.numpy()[:, None] * far,
+        points.numpy() + in_points.numpy()[:, None] * far,
         balanced_tree=False,
         compact_nodes=False,
     )
     distance, index = tree.query(
-        centres.detach().numpy() + in_centres.numpy()[:, None] * far,
+        centres.numpy() + in_centres.numpy()[:, None] * far,
         k=np.arange(1, count + 1),
         distance_upper_bound=radius_m,
         workers=torch.get_num_threads(),

@@ -16,8 +16,9 @@ def farthest_points(xyz: Tensor, count: int, first: int = 0) -> Tensor:
     if xyz.device.type == 'cpu':
         import fpsample
 
-        chosen = fpsample.bucket_fps_kdline_sampling(
-            np.ascontiguousarray(xyz.detach().numpy(), np.float32), count, h=5, start_idx=first
+        # Its faster samplers begin anywhere: the same cloud would get other keypoints each time.
+        chosen = fpsample.fps_sampling(
+            np.ascontiguousarray(xyz.detach().numpy(), np.float32), count, start_idx=first
         )
         return torch.from_numpy(chosen.astype(np.int64))
     chosen = torch.empty(count, dtype=torch.long, device=xyz.device)

@@ -115,7 +115,7 @@ class Lcdnet(nn.Module):
         number: int,
         generator: np.random.Generator | None,
     ) -> Tensor:
-        """Choose keypoints [B N x 3]: of the points, or of the finest voxels if these are coarse."""
+        """Choose keypoints [B N x 3]: of the points, or of finest voxels that are coarse."""
         s, chosen = self.settings, []
         of_points = not s.relative_input
         xyz = clouds.xyz if of_points else voxels.xyz

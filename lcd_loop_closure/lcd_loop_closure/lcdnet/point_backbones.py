@@ -1,5 +1,7 @@
 """Backbones on keypoints alone: what the thesis's Table 3.8 compares PV-RCNN with."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -42,7 +44,7 @@ class PointNet(nn.Module):
 
 
 class EdgeConv(nn.Module):
-    """Convolve over a graph of neighbours, found anew in each layer's features (DGCNN, TOG 2019)."""
+    """Convolve over neighbours, found anew in each layer's features (DGCNN, TOG 2019)."""
 
     def __init__(self, feature_size: int, reach_m: float, neighbours: int = 16) -> None:
         super().__init__()
@@ -62,7 +64,7 @@ class EdgeConv(nn.Module):
 
 
 class RandlaNet(nn.Module):
-    """Aggregate neighbours by attention on ever fewer points, then go back (Hu et al., CVPR 2020)."""
+    """Aggregate neighbours by attention on ever fewer points, and back (Hu et al., CVPR 2020)."""
 
     def __init__(
         self, feature_size: int, reach_m: float, neighbours: int = 16, levels: int = 3
@@ -71,12 +73,8 @@ class RandlaNet(nn.Module):
         self.reach_m, self.neighbours = reach_m, neighbours
         widths = [16 * 2**level for level in range(levels + 1)]
         self.begin = _layer(3, widths[0])
-        self.encode = nn.ModuleList(
-            _Aggregation(a, b) for a, b in zip(widths, widths[1:], strict=False)
-        )
-        self.decode = nn.ModuleList(
-            _layer(a + b, a) for a, b in zip(widths, widths[1:], strict=False)
-        )
+        self.encode = nn.ModuleList(_Aggregation(a, b) for a, b in pairwise(widths))
+        self.decode = nn.ModuleList(_layer(a + b, a) for a, b in pairwise(widths))
         self.out = nn.Sequential(_layer(widths[0], 64), nn.Linear(64, feature_size))
 
     def forward(self, xyz: Tensor) -> Tensor:

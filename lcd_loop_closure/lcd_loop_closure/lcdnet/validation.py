@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from lcd_common import se3
-from lcd_loop_closure.lcdnet.feature_registration import FeatureRegistration
+from lcd_loop_closure.feature_registration import FeatureRegistration
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import PlaceShard
 from lcd_loop_closure.lcdnet.voxels import Clouds

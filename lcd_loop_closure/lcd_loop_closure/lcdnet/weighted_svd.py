@@ -20,8 +20,8 @@ class _SafeSvd(torch.autograd.Function):
         squared = S * S
         difference = squared[..., None, :] - squared[..., :, None]
         # 1 / (s_j^2 - s_i^2), smoothly bounded: x / (x^2 + eps) in place of 1 / x.
-        scale = squared.amax(-1)[..., None, None].clamp(min=1e-30)
-        F = difference / (difference**2 + (1e-6 * scale) ** 2)
+        scale = squared.amax(-1)[..., None, None]
+        F = difference / (difference**2 + ((1e-6 * scale) ** 2).clamp(min=1e-24))
         UtgU = U.transpose(-1, -2) @ grad_U
         VtgV = V.transpose(-1, -2) @ grad_Vh.transpose(-1, -2)
         skew_u = F * (UtgU - UtgU.transpose(-1, -2))
@@ -37,6 +37,14 @@ def weighted_svd(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         source, target: [B x N x 3] matched points, metres.
         weight: [B x N], at least zero.
     """
+    # Half precision has neither the digits nor the routines.
+    with torch.autocast(source.device.type, enabled=False):
+        return _solve(
+            *(x if x.dtype == torch.float64 else x.float() for x in (source, target, weight))
+        )
+
+
+def _solve(source: Tensor, target: Tensor, weight: Tensor) -> Tensor:
     w = (weight / weight.sum(1, keepdim=True).clamp(min=1e-12))[..., None]
     mean_source, mean_target = (w * source).sum(1), (w * target).sum(1)
     H = (w * (source - mean_source[:, None])).transpose(1, 2) @ (target - mean_target[:, None])

@@ -224,9 +224,13 @@ class LoopClosureNode(Node):
         except DataError as error:
             self._reject('points', 'broken', str(error))
             return
-        keyframe = self._search.keyframe(
-            scan.session, scan.pose, cloud.transformed(scan.T_base_lidar)
-        )
+        try:
+            keyframe = self._search.keyframe(
+                scan.session, scan.pose, cloud.transformed(scan.T_base_lidar)
+            )
+        except DataError as error:
+            self._reject('points', 'too few', str(error))
+            return
         if keyframe is None:
             self._reject('points', 'empty', 'a cloud has no points in range')
             return

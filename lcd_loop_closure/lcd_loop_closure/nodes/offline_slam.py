@@ -39,7 +39,11 @@ class OfflineSlam:
     """Odometry, loop closure and pose graph in one process, fed by hand, listened to."""
 
     def __init__(
-        self, context: Context, parameter_files: Sequence[Path], threads: int | None
+        self,
+        context: Context,
+        parameter_files: Sequence[Path],
+        threads: int | None,
+        detector: str | None = None,
     ) -> None:
         """Make the nodes.
 
@@ -47,6 +51,7 @@ class OfflineSlam:
             context: that they live in.
             parameter_files: ROS parameter files; what lock-step needs holds above them.
             threads: of registration, 0 is all cores; None is what the parameter files say.
+            detector: what describes places; None is what the parameter files say.
 
         Raises:
             ConfigError: a parameter has the wrong type or lies out of its range.
@@ -64,7 +69,10 @@ class OfflineSlam:
 
         given = {} if threads is None else {'threads': threads}
         self.odometry = LidarOdometryNode(**options(**given))
-        self.loop_closure = LoopClosureNode(**options())
+        chosen: dict[str, object] = {} if detector is None else {'descriptor__method': detector}
+        if threads is not None:
+            chosen['lcdnet__threads'] = threads
+        self.loop_closure = LoopClosureNode(**options(**chosen))
         self.pose_graph = PoseGraphNode(**options())
         self.nodes = (self.odometry, self.loop_closure, self.pose_graph)
         self.lockstep = LockStep(self.nodes)
@@ -161,6 +169,7 @@ def drive_through(
     start_s: float = 0.0,
     duration_s: float | None = None,
     threads: int | None = None,
+    detector: str | None = None,
     parameter_files: Sequence[Path] = (),
     progress: bool = True,
 ) -> DriveResult:
@@ -174,6 +183,7 @@ def drive_through(
         start_s: seconds of the drive to leave out at its beginning.
         duration_s: seconds to drive; None is to the end.
         threads: of registration, 0 is all cores, one repeats exactly; None: as the files say.
+        detector: 'lcdnet' or 'scan_context'; None: as the files say.
         parameter_files: ROS parameter files for the nodes.
         progress: show a bar on stderr.
 
@@ -182,7 +192,7 @@ def drive_through(
         DataError: the drive cannot be read.
     """
     with own_context() as context:
-        slam = OfflineSlam(context, parameter_files, threads)
+        slam = OfflineSlam(context, parameter_files, threads, detector)
         try:
             wall_s, interrupted = slam.drive(drive, start_s, duration_s, progress)
             return slam.result(drive, source, wall_s, interrupted)

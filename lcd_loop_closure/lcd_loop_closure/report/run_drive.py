@@ -75,6 +75,7 @@ def _run(arguments: argparse.Namespace) -> int:
         start_s=arguments.start,
         duration_s=arguments.duration,
         threads=arguments.threads,
+        detector=arguments.detector,
         parameter_files=arguments.params,
         progress=not arguments.quiet,
     )
@@ -151,6 +152,8 @@ def _parser() -> argparse.ArgumentParser:
         help='ROS parameter file for the nodes (repeatable)')  # fmt: skip
     add('--threads', type=_count, metavar='N',
         help='threads of registration; 1 repeats exactly, 0: all cores (default)')  # fmt: skip
+    add('--detector', choices=('lcdnet', 'scan_context'),
+        help='what finds loops by their looks (default: lcdnet)')  # fmt: skip
     add('--start', type=_seconds, default=0.0, metavar='S', help='leave out the first S seconds')
     add('--duration', type=_seconds, metavar='S', help='drive S seconds only')
     add('--truth', type=Path, metavar='FILE', help='reference poses: TUM or KITTI')

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lcd_common import se3
-from lcd_loop_closure.lcdnet.feature_registration import (
+from lcd_loop_closure.feature_registration import (
     FeatureRegistration,
     FeatureRegistrationConfig,
     rigid_motion,
