@@ -85,6 +85,41 @@ TABLES: dict[str, tuple[Row, ...]] = {
         Row('— odometry latency, 99 %', '{:.0f} ms',
             ('live_10hz.odometry_latency_p99_ms',), '≤ 150 ms'),
     ),
+    'lcdnet': (
+        Row('Average precision, protocol 1, same way / reverse: LCDNet', '{:.3f} / {:.3f}',
+            ('ap.protocol1.same_way.lcdnet', 'ap.protocol1.reverse.lcdnet'), '≥ 0.97 / 0.95'),
+        *(
+            Row(f'— {name}', '{:.3f} / {:.3f}',
+                (f'ap.protocol1.same_way.{key}', f'ap.protocol1.reverse.{key}'), 'below LCDNet')
+            for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'),
+                              ('isc', 'Intensity Scan Context'), ('m2dp', 'M2DP'),
+                              ('map_closures', 'MapClosures'))
+        ),
+        Row('Protocol 2, same way / reverse: LCDNet', '{:.3f} / {:.3f}',
+            ('ap.protocol2.same_way.lcdnet', 'ap.protocol2.reverse.lcdnet'), 'above all'),
+        *(
+            Row(f'— {name}', '{:.3f} / {:.3f}',
+                (f'ap.protocol2.same_way.{key}', f'ap.protocol2.reverse.{key}'), 'below LCDNet')
+            for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'))
+        ),
+        *(
+            Row(f'Registered within 2 m and 5°, {band.replace("_", "-")} m apart: '
+                'LCDNet / KISS-Matcher / FPFH + RANSAC', '{:.1f} / {:.1f} / {:.1f} %',
+                tuple(f'registration.{band}.success.{method}'
+                      for method in ('lcdnet', 'kiss_matcher', 'fpfh_ransac')), asked, 100)
+            for band, asked in (('0_4', '≥ 99.5 %'), ('4_10', ''), ('10_15', '≥ 90 %'))
+        ),
+        Row('Real pair KITTI 00 52 / 4501, worst of 20 yaws', '{:.2f} m, {:.2f}°',
+            ('real.kitti_00.pair_translation_error_m', 'real.kitti_00.pair_rotation_error_deg'),
+            '≤ 0.35 m, 0.6°'),
+        Row('Descriptor and features of a sweep, two cores', '{:.0f} ms',
+            ('descriptor_ms.compact_cpu',), '≤ 150 ms'),
+        Row('— the full-size network', '{:.0f} ms', ('descriptor_ms.full_cpu',), '≤ 600 ms'),
+        Row('Registration from stored keypoints', '{:.0f} ms', ('registration_ms',), '≤ 100 ms'),
+        Row('Query among 18,235 / 1,000,000', '{:.2f} / {:.1f} ms',
+            ('query_ms.18235', 'query_ms.1000000'), '≤ 1 / 20 ms'),
+        Row('Memory of a keyframe', '{:.0f} kB', ('keyframe_bytes',), '≤ 500 kB', 1e-3),
+    ),
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -42,11 +43,25 @@ def test_pairs_show_one_place_within_the_distance() -> None:
         headings.append(float(a.T_world_lidar[:3, 0] @ b.T_world_lidar[:3, 0]))
         near = np.linalg.norm(a.xyz.numpy(), axis=1) < 15.0
         away = cKDTree(world(b)).query(world(a)[near])[0]
-        spacing_m = 15.0 * np.radians({'vlp16': 2.0, 'os1_64': 0.7}[a.sensor])
-        assert np.median(away) < spacing_m  # of the rings, where they are farthest apart
+        # No more than the spacing of the rings, which lie two degrees apart on a VLP-16.
+        assert np.median(away) < {'vlp16': 15.0 * np.radians(2.0), 'os1_64': 0.3}[a.sensor]
         assert a.xyz.dtype == torch.float32 and len(a.intensity) == len(a.xyz)
         assert float(a.intensity.min()) >= 0.0 and float(a.intensity.max()) <= 1.0
     assert min(headings) < -0.9 and max(headings) > 0.9
+
+
+@pytest.mark.parametrize('caster', ['embree', 'torch'])
+def test_places_hold_sweeps_as_far_apart_as_asked(caster: str) -> None:
+    settings = replace(SMALL, caster=caster, sensors=('vlp16',))
+    stream = SweepStream(TRAIN_SEEDS[:1], settings)
+    for sweeps in islice(stream.places([(0.0, 4.0), (4.0, 15.0)]), 3):
+        at = [sweep.T_world_lidar[:3, 3] for sweep in sweeps]
+        near, far = (float(np.linalg.norm(at[k] - at[0])) for k in (1, 2))
+        assert near <= 4.0 < far <= 15.0
+        for sweep in sweeps:
+            assert 1.6 <= sweep.height_m <= 1.9
+            below = sweep.xyz.numpy()[np.linalg.norm(sweep.xyz.numpy()[:, :2], axis=1) < 8.0, 2]
+            assert abs(float(np.percentile(below, 5)) + sweep.height_m) < 0.35
 
 
 def test_the_same_seed_streams_the_same_sweeps() -> None:
@@ -75,5 +90,7 @@ def test_patches_are_those_of_the_numpy_sensor() -> None:
 def test_mistakes_are_told() -> None:
     with pytest.raises(ConfigError, match='at least one town'):
         SweepStream([])
+    with pytest.raises(ConfigError, match='the caster is auto'):
+        SweepStream([1], StreamConfig(caster='optix'))
     with pytest.raises(ConfigError, match='a lidar is one of'):
         SweepStream([1], StreamConfig(sensors=('sick',)))
