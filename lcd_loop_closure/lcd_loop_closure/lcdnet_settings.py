@@ -9,7 +9,11 @@ class LcdnetDescriptorConfig:
 
     weights: str = setting('', 'file of train_lcdnet; empty: the compact one that ships')
     device: str = setting('auto', 'auto (a GPU where there is one), cpu, cuda or cuda:N')
-    threads: int = setting(0, 'of torch in this process; 0 leaves them as they are', low=0)
+    threads: int = setting(
+        1,
+        'of torch in this process; more fight with other busy processes for the cores; 0: all',
+        low=0,
+    )
     max_distance: float = setting(
         0.9, 'candidates that look less alike are not registered', low=0.0
     )

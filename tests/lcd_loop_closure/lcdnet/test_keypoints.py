@@ -16,8 +16,13 @@ def _brute_force(xyz, count, first):
 
 def test_points_are_those_of_brute_force():
     xyz = np.random.default_rng(0).normal(0.0, 20.0, (700, 3)).astype(np.float32)
-    chosen = farthest_points(torch.from_numpy(xyz), 60, 17)
-    assert chosen.tolist() == _brute_force(xyz, 60, 17)
+    begun = set()
+    for first in (0, 17, 300):
+        chosen = farthest_points(torch.from_numpy(xyz), 60, first).tolist()
+        assert chosen == _brute_force(xyz, 60, chosen[0])
+        assert chosen == farthest_points(torch.from_numpy(xyz), 60, first).tolist()
+        begun.add(chosen[0])
+    assert len(begun) > 1
 
 
 def test_small_clouds_repeat():
