@@ -22,6 +22,11 @@ from lcd_loop_closure.lcdnet.config import COMPACT, FULL, LcdnetConfig
 from lcd_loop_closure.lcdnet.curves import draw_curves
 from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
+from lcd_loop_closure.lcdnet.place_head import (
+    PlaceHeadConfig,
+    place_features,
+    train_place_head,
+)
 from lcd_loop_closure.lcdnet.places import PlaceShard, simulated_shard
 from lcd_loop_closure.lcdnet.training import Trainer, TrainingConfig
 from lcd_loop_closure.lcdnet.validation import validate
@@ -48,6 +53,7 @@ _EXAMPLES = """
 examples:
   train_lcdnet --out runs/compact                          the model that ships, on two CPU cores
   train_lcdnet --out runs/compact --minutes 60             an hour of it; the same again goes on
+  train_lcdnet --out runs/compact --place-head             then its place head, in large batches
   train_lcdnet --network full --out runs/full --device cuda
   torchrun --nproc-per-node 4 -m lcd_loop_closure.lcdnet.train --network full --out runs/full
   train_lcdnet --out runs/d64 --set feature_size=64        one row of the ablation tables
@@ -69,7 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _train(arguments: argparse.Namespace) -> None:
     network_settings, training = _NETWORKS[arguments.network]
     network_settings = _changed(network_settings, arguments.set)
-    training = _changed(training, arguments.train)
+    if not arguments.place_head:
+        training = _changed(training, arguments.train)
     torch.set_num_threads(arguments.threads or torch.get_num_threads())
     device, rank, processes = _join(arguments.device)
     out: Path = arguments.out
@@ -83,6 +90,9 @@ def _train(arguments: argparse.Namespace) -> None:
         torch.distributed.barrier()
     shards = [PlaceShard.load(shard_path(data, town)) for town in towns]
     held_out = [PlaceShard.load(shard_path(data, town)) for town in judged]
+    if arguments.place_head:
+        _train_head(shards, held_out, arguments, device)
+        return
     torch.manual_seed(training.seed)
     network = Lcdnet(network_settings)
     trainer = Trainer(
@@ -105,15 +115,49 @@ def _train(arguments: argparse.Namespace) -> None:
         )
         last = record.step == training.steps
         if rank == 0 and (record.step % arguments.validate_every == 0 or last):
-            _judge(trainer, held_out, arguments)
+            _judge(trainer.network, trainer.step, asdict(training), held_out, arguments)
     bar.close()
 
 
-def _judge(trainer: Trainer, held_out: Sequence[PlaceShard], arguments: argparse.Namespace) -> None:
+def _train_head(
+    shards: Sequence[PlaceShard],
+    held_out: Sequence[PlaceShard],
+    arguments: argparse.Namespace,
+    device: torch.device,
+) -> None:
+    """Train the place head of the best network on features that are computed once."""
+    best = arguments.out / 'best.safetensors'
+    if not best.is_file():
+        raise ConfigError(f'--place-head goes on from {best}: train the network there first')
+    network, facts = checkpoint.load_network(best, device)
+    settings = _changed(PlaceHeadConfig(), arguments.train)
+    total = sum(len(shard) for shard in shards)
+    with tqdm(total=total, unit='place', desc='features', disable=arguments.quiet) as bar:
+        features = place_features(
+            network, shards, AugmentationConfig(), progress=lambda: _advance(bar)
+        )
+    training = {**facts['training'], 'place_head': asdict(settings)}
+    begin = int(facts['validation']['step'])
+    with tqdm(total=settings.steps, unit='step', desc='place head', disable=arguments.quiet) as bar:
+        for step, loss, violated in train_place_head(network, features, settings):
+            bar.update()
+            bar.set_postfix(loss=f'{loss:.3f}', violated=f'{violated:.2f}')
+            if step % arguments.validate_every == 0 or step == settings.steps:
+                _judge(network, begin + step, training, held_out, arguments)
+                network.place.train()
+
+
+def _judge(
+    network: Lcdnet,
+    step: int,
+    training: dict[str, Any],
+    held_out: Sequence[PlaceShard],
+    arguments: argparse.Namespace,
+) -> None:
     """Validate, keep the best network with its card, and draw the curves."""
     out: Path = arguments.out
-    result = validate(trainer.network, held_out, arguments.validation_places)
-    row = {'step': trainer.step, 'score': result.score, **asdict(result)}
+    result = validate(network, held_out, arguments.validation_places)
+    row = {'step': step, 'score': result.score, **asdict(result)}
     log = out / 'validation.jsonl'
     before = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     best = max((float(one['score']) for one in before), default=float('-inf'))
@@ -124,11 +168,11 @@ def _judge(trainer: Trainer, held_out: Sequence[PlaceShard], arguments: argparse
             'trained_on': 'simulation only: towns 0-99 of bags.simulation',
             'chosen_on': 'validation towns from 100 on',
             'command': 'train_lcdnet ' + ' '.join(sys.argv[1:]),
-            'training': asdict(trainer.settings),
+            'training': training,
             'torch': torch.__version__,
             'validation': row,
         }
-        checkpoint.save_network(out / 'best.safetensors', trainer.network, facts)
+        checkpoint.save_network(out / 'best.safetensors', network, facts)
         (out / 'best.json').write_text(json.dumps(facts, indent=1) + '\n')
     draw_curves(out)
 
@@ -216,6 +260,11 @@ def _parser() -> argparse.ArgumentParser:
     add('--threads', type=int, help='of the CPU (default: all)')
     add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the network')
     add('--train', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the training')
+    add(
+        '--place-head',
+        action='store_true',
+        help='train the place head of the best network in --out further, in large batches',
+    )
     add('--quiet', action='store_true', help='no progress bars')
     return parser
 
