@@ -165,7 +165,8 @@ def _judge(
         file.write(json.dumps(row) + '\n')
     if result.score > best:
         facts = {
-            'trained_on': 'simulation only: towns 0-99 of bags.simulation',
+            'trained_on': 'simulation only: towns 0 to '
+            f'{arguments.towns - 1} of bags.simulation',
             'chosen_on': 'validation towns from 100 on',
             'command': 'train_lcdnet ' + ' '.join(sys.argv[1:]),
             'training': training,
