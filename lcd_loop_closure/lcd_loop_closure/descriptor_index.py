@@ -73,8 +73,12 @@ class Euclidean:
 
         |r - q|^2 = r^2 + q^2 - 2 r q: one product in place of a copy of all rows.
         """
-        squared = np.einsum('ij,ij->i', rows, rows) - 2.0 * (rows @ query) + query @ query
-        return np.sqrt(np.maximum(squared, 0.0)), None
+        total = np.einsum('ij,ij->i', rows, rows) + query @ query
+        squared = total - 2.0 * (rows @ query)
+        # Of near ones the difference of large numbers leaves too few digits.
+        near = squared < 0.05 * total
+        squared[near] = np.square(rows[near] - query).sum(1)
+        return np.sqrt(squared), None
 
 
 @dataclass(frozen=True)

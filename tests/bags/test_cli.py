@@ -157,6 +157,8 @@ def test_an_interrupted_convert_leaves_nothing(tmp_path: Path, how: signal.Signa
         ],
         stderr=subprocess.PIPE,
         text=True,
+        # A shell's background jobs ignore Ctrl-C, and so would their children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stderr is not None
     seen = ''

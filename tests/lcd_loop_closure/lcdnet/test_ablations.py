@@ -30,9 +30,9 @@ def test_backbones_describe_keypoints_whatever_their_order_in_the_cloud(backbone
 def test_heads_give_rotations_and_learn(head, tmp_path):
     torch.manual_seed(0)
     network = Lcdnet(replace(TINY, pose_head=head))
-    settings = TrainingConfig(steps=25, places=3, learning_rate=0.003, warmup=1)
+    settings = TrainingConfig(steps=60, places=3, learning_rate=0.01, warmup=1, clip=0.0)
     records = list(Trainer(network, [street_shard(1)], tmp_path, settings).run())
-    assert np.mean([r.pose_m for r in records[-6:]]) < np.mean([r.pose_m for r in records[:6]])
+    assert np.mean([r.pose_m for r in records[-20:]]) < np.mean([r.pose_m for r in records[:20]])
     assert records[0].transport_m == 0.0
     xyz = torch.from_numpy(street(np.random.default_rng(1)))
     with torch.no_grad():
