@@ -161,9 +161,7 @@ def _negative_pairs(
     sets = {
         'kitti_00': list(within.values()),
         'kitti_360': [prepare(pairs, cloud) for cloud in clouds(data / 'kitti_360')],
-        'argoverse2': [
-            prepare(pairs, cloud) for cloud in clouds(data / 'argoverse2' / '7fab2350')
-        ],
+        'argoverse2': [prepare(pairs, cloud) for cloud in clouds(data / 'argoverse2' / '7fab2350')],
     }
     for (a, matches), (b, queries) in itertools.combinations(sets.items(), 2):
         for (i, match), (j, query) in itertools.product(enumerate(matches), enumerate(queries)):

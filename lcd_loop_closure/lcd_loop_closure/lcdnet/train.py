@@ -165,8 +165,7 @@ def _judge(
         file.write(json.dumps(row) + '\n')
     if result.score > best:
         facts = {
-            'trained_on': 'simulation only: towns 0 to '
-            f'{arguments.towns - 1} of bags.simulation',
+            'trained_on': f'simulation only: towns 0 to {arguments.towns - 1} of bags.simulation',
             'chosen_on': 'validation towns from 100 on',
             'command': 'train_lcdnet ' + ' '.join(sys.argv[1:]),
             'training': training,

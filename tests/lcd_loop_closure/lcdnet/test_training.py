@@ -157,9 +157,7 @@ def test_the_place_head_learns_on_its_own_and_nothing_else_changes():
     losses = [loss for _, loss, _ in train_place_head(network, features, settings)]
     assert np.mean(losses[-15:]) < 0.8 * np.mean(losses[:15])
     changed = {
-        name
-        for name, value in network.state_dict().items()
-        if not torch.equal(value, before[name])
+        name for name, value in network.state_dict().items() if not torch.equal(value, before[name])
     }
     assert changed and all(name.startswith('place.') for name in changed)
     with pytest.raises(ConfigError, match='at least one town'):
