@@ -11,6 +11,8 @@ import pytest
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_DOMAIN_ID'] = str(60 + os.getpid() % 40)
 os.environ.setdefault('RCUTILS_LOGGING_USE_STDOUT', '0')
+# Before torch is imported: its threads and those of other busy processes wait for each other.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 
