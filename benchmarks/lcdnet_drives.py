@@ -2,15 +2,16 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bags.simulation.drive import SensorsConfig, SimulatedDrive
-from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.stream import TEST_SEEDS
 from benchmarks.lcdnet_peers import judge_map_closures
+from benchmarks.simulated_drives import JOURNEYS, SPACING_M
 from lcd_common.errors import LocalizationError
 from lcd_loop_closure.evaluation.drive_sweeps import store_drive
 from lcd_loop_closure.evaluation.methods import Methods
@@ -26,9 +27,6 @@ from lcd_loop_closure.evaluation.sweep_views import (
 from lcd_loop_closure.revisits import RevisitConfig
 
 METHODS = ('lcdnet', 'scan_context', 'scan_context_50', 'm2dp', 'isc', 'lidar_iris')
-_SPACING_M = 1.0  # KITTI's cars take a scan a metre
-# One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
-_SHARES = {'same_way': (0.3, 0.0), 'reverse': (0.0, 0.3)}
 LENGTH_M = 2500.0
 _UNSEEN = 'beams32'
 
@@ -62,20 +60,19 @@ def rendered(
     name = f'town_{seed}_{kind}_run{run}_{sensor}_{length:.0f}'
     folder = work / 'sweeps' / name
     if not is_stored(folder):
-        same_way, reverse = _SHARES[kind]
-        journey = JourneyConfig(length=length, same_way=same_way, reverse=reverse, lateral=1.5)
+        journey = replace(JOURNEYS[kind], length=length)
         drive = SimulatedDrive(seed, run, journey, SensorsConfig(lidar=sensor, imu='', gnss=False))
         drive.name = name
-        expected = int(length / _SPACING_M)
+        expected = int(length / SPACING_M)
         with terminal_bar(f'casting {name}', expected) as step:
-            store_drive(drive, folder, spacing_m=_SPACING_M, progress=lambda done, of: step())
+            store_drive(drive, folder, spacing_m=SPACING_M, progress=lambda done, of: step())
     return StoredSweeps(folder)
 
 
 def detection(work: Path, towns: int = 3) -> dict[str, Any]:
     """Return average precision by protocol, class and method: means over towns, and each town's."""
     found: dict[str, dict[str, Any]] = {}
-    for kind in _SHARES:
+    for kind in JOURNEYS:
         for seed in TEST_SEEDS[:towns]:
             sweeps = rendered(work, kind, seed)
             judged = study_detection(
@@ -124,7 +121,7 @@ def changed(work: Path, length_m: float | None = None) -> dict[str, Any]:
         folder=work / 'descriptors', bar=terminal_bar,
     )['whole']  # fmt: skip
     unseen = {}
-    for kind in _SHARES:
+    for kind in JOURNEYS:
         sweeps = rendered(work, kind, seed, sensor=_UNSEEN, length_m=length_m)
         unseen[kind] = {
             f'town_{seed}': study_detection(
@@ -141,7 +138,7 @@ def changed(work: Path, length_m: float | None = None) -> dict[str, Any]:
 def sectors(work: Path, towns: int = 3, length_m: float | None = None) -> dict[str, Any]:
     """Return average precision with sectors removed at random, and with the rear blocked."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    for kind in _SHARES:
+    for kind in JOURNEYS:
         for seed in TEST_SEEDS[:towns]:
             sweeps = rendered(work, kind, seed, length_m=length_m)
             blocked = RearBlocked(sweeps)

@@ -20,9 +20,9 @@ from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 
 _HEIGHT_M = 1.73
 _MEAN_SPEED_M_S = 6.3  # of the simulated journeys, stops included
-_SPACING_M = 1.0  # KITTI's cars take a scan a metre
+SPACING_M = 1.0  # KITTI's cars take a scan a metre
 # One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
-_JOURNEYS = {
+JOURNEYS = {
     'same_way': JourneyConfig(length=2500.0, same_way=0.3, reverse=0.0, lateral=1.5),
     'reverse': JourneyConfig(length=2500.0, same_way=0.0, reverse=0.3, lateral=1.5),
 }
@@ -32,16 +32,14 @@ def scan_context(work: Path, towns: int = 3) -> dict[str, Any]:
     """Return Scan Context's average precision by protocol 1 on drives through test towns."""
     del work
     figures: dict[str, Any] = {}
-    for name, journey in _JOURNEYS.items():
+    for name, journey in JOURNEYS.items():
         curves = {}
         for seed in TEST_SEEDS[:towns]:
             curve, places = judge(SimulatedDrive(SimulatedTown(seed), journey=journey))
             curves[f'town_{seed}'] = {'average_precision': curve.average_precision, **places}
         figures[name] = float(np.mean([c['average_precision'] for c in curves.values()]))
         figures[f'{name}_by_town'] = curves
-    aliased = SimulatedDrive(
-        SimulatedTown(TEST_SEEDS[-1], 'aliased'), journey=_JOURNEYS['same_way']
-    )
+    aliased = SimulatedDrive(SimulatedTown(TEST_SEEDS[-1], 'aliased'), journey=JOURNEYS['same_way'])
     curve, places = judge(aliased)
     figures['aliased_same_way'] = curve.average_precision
     figures['aliased_same_way_by_town'] = places
@@ -85,7 +83,7 @@ def spaced(drive: SimulatedDrive) -> tuple[list[int], se3.Array]:
     poses = drive.truth().T_world_body
     kept = [0]
     for index in range(1, len(poses)):
-        if np.linalg.norm(poses[index, :3, 3] - poses[kept[-1], :3, 3]) >= 0.95 * _SPACING_M:
+        if np.linalg.norm(poses[index, :3, 3] - poses[kept[-1], :3, 3]) >= 0.95 * SPACING_M:
             kept.append(index)
     return kept, poses[kept]
 

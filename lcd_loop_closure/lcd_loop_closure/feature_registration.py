@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.settings import config, setting
+from lcd_loop_closure.local_features import LocalFeatures
 
 
 @config
@@ -61,6 +62,15 @@ class FeatureRegistration:
             chosen &= _largest(np.ascontiguousarray(cosine.T), k).T
         rows, columns = np.nonzero(chosen)
         return rows, columns, cosine[rows, columns]
+
+    def register(self, query: LocalFeatures, match: LocalFeatures) -> list[FeatureHypothesis]:
+        """Return what `search` finds for two sweeps."""
+        return self.search(
+            query.keypoints,
+            query.values.astype(np.float32),
+            match.keypoints,
+            match.values.astype(np.float32),
+        )
 
     def search(
         self,

@@ -142,12 +142,7 @@ class PairRegistration:
     ) -> PairResult | None:
         """Judge the answers of the features; None when the best does not fit the clouds."""
         with self._timer('register'):
-            found = self.by_features.search(
-                of_query.keypoints,
-                of_query.values.astype(np.float32),
-                of_match.keypoints,
-                of_match.values.astype(np.float32),
-            )
+            found = self.by_features.register(of_query, of_match)
         if not found:
             return None
         with self._timer('refine'):

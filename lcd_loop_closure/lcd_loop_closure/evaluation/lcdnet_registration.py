@@ -58,12 +58,7 @@ class LcdnetRansac:
 
     def register(self, match: LocalFeatures, query: LocalFeatures) -> se3.Array | None:
         """Return T_match_query; None without enough matches that agree."""
-        found = self._registration.search(
-            query.keypoints,
-            query.values.astype(np.float32),
-            match.keypoints,
-            match.values.astype(np.float32),
-        )
+        found = self._registration.register(query, match)
         return found[0].T_match_query if found else None
 
 

@@ -24,9 +24,9 @@ class Losses:
     transport: Tensor
     violated: float
 
-    def total(self, beta: float) -> Tensor:
-        """Return the weighted sum (equation 17)."""
-        return self.triplet + self.pose + beta * self.transport
+    def total(self, beta: float, pose_weight: float = 1.0) -> Tensor:
+        """Return the weighted sum (equation 17, where the pose has the weight 1)."""
+        return self.triplet + pose_weight * self.pose + beta * self.transport
 
 
 def triplet_loss(

@@ -184,8 +184,7 @@ class Trainer:
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=s.half):
             losses, matching, apart = self._losses(batch, rng)
-        total = losses.triplet + s.pose_weight * losses.pose + s.beta * losses.transport
-        total = total + s.matching_weight * matching
+        total = losses.total(s.beta, s.pose_weight) + s.matching_weight * matching
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         if self._processes > 1:
