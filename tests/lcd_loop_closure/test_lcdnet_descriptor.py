@@ -1,37 +1,23 @@
 """LCDNet as a place descriptor, with an untrained network of a size that takes milliseconds."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from lcdnet_samples import TINY as SAMPLE
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError, DataError
 from lcd_loop_closure import lcdnet_descriptor
-from lcd_loop_closure.lcdnet import Lcdnet, LcdnetConfig
+from lcd_loop_closure.lcdnet import Lcdnet
 from lcd_loop_closure.lcdnet.checkpoint import save_network
 from lcd_loop_closure.lcdnet_descriptor import LcdnetDescriptor
 from lcd_loop_closure.lcdnet_settings import LcdnetDescriptorConfig
 
-TINY = LcdnetConfig(
-    voxel=1.0,
-    reach=24.0,
-    z_low=-2.0,
-    z_high=10.0,
-    relative_input=True,
-    channels=(8, 8, 8, 8),
-    blocks=(1, 1, 1, 1),
-    covered=False,
-    bev_channels=4,
-    group_source=(1, 3),
-    group_radius=(2.5, 6.0),
-    group_count=(8, 8),
-    group_width=(8, 8),
-    keypoints=48,
-    feature_size=16,
-    clusters=8,
-    descriptor_size=32,
+TINY = replace(
+    SAMPLE, group_source=(1, 3), group_radius=(2.5, 6.0), group_count=(8, 8), group_width=(8, 8)
 )
 
 

@@ -1,32 +1,26 @@
 """A small world with a drive through it, and a network that takes milliseconds."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from lcdnet_samples import TINY as SAMPLE
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_loop_closure.lcdnet import Lcdnet, LcdnetConfig
+from lcd_loop_closure.lcdnet import Lcdnet
 from lcd_loop_closure.lcdnet.checkpoint import save_network
 
-TINY = LcdnetConfig(
-    voxel=1.0,
+TINY = replace(
+    SAMPLE,
     reach=40.0,
-    z_low=-2.0,
-    z_high=10.0,
-    relative_input=True,
-    channels=(8, 8, 8, 8),
-    blocks=(1, 1, 1, 1),
-    covered=False,
-    bev_channels=4,
     group_source=(1, 2, 3, 4),
     group_radius=(2.5, 5.0, 9.0, 12.0),
     group_count=(8, 8, 8, 8),
     group_width=(8, 8, 8, 8),
     keypoints=96,
     feature_size=24,
-    clusters=8,
     descriptor_size=64,
 )
 
