@@ -1,0 +1,1 @@
+"""Connect the filters and the localization in a map to ROS 2."""
