@@ -1,0 +1,1 @@
+"""Answer "which known place is this, and is that to be believed?" (thesis chapter 4)."""

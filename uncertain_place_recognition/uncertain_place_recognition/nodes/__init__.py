@@ -1,0 +1,1 @@
+"""Connect place recognition to ROS 2."""
