@@ -101,6 +101,18 @@ class CompactSearch:
         order = np.lexsort((chosen, distance))[:count]
         return chosen[order].astype(np.intp), distance[order]
 
+    def search(
+        self, row: NDArray[np.float32], count: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32], None]:
+        """Return what `nearest` does; these descriptors hold no yaw."""
+        return *self.nearest(row, count), None
+
+    def keep(self, numbers: NDArray[np.intp]) -> None:
+        """Forget all other rows."""
+        rows = self._full[numbers]
+        self._size, self._rounding = 0, 0.0
+        self.add(rows)
+
     def _grow(self, needed: int) -> None:
         held = len(self._full)
         if needed <= held:

@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 from lcd_loop_closure.local_features import LocalFeatures
 
+if TYPE_CHECKING:
+    from lcd_loop_closure.compact_search import CompactSearch
+
 
 class Metric(Protocol):
     """How descriptors are compared: `ScanContext` turns columns, `Euclidean` does not."""
@@ -18,6 +21,10 @@ class Metric(Protocol):
     @property
     def row_length(self) -> int:
         """Numbers that are stored for each descriptor."""
+
+    @property
+    def unit_length(self) -> bool:
+        """Whether rows have unit length and are compared by their L2 distance."""
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what has to be stored of a descriptor."""
@@ -54,8 +61,9 @@ class PlaceDescriptor(Metric, Protocol):
 class Euclidean:
     """Compare fixed-length vectors by their L2 distance (LCDNet's descriptors, thesis 3.2)."""
 
-    def __init__(self, length: int) -> None:
-        self.row_length = length
+    def __init__(self, length: int, *, unit_length: bool = False) -> None:
+        """Compare vectors of `length` numbers, all of them of unit length where that is told."""
+        self.row_length, self.unit_length = length, unit_length
 
     def row(self, descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the descriptor; raises DataError on another length."""
@@ -111,13 +119,12 @@ class DescriptorIndex:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._rows = np.empty((64, self.metric.row_length), np.float32)
+        self._rows = _rows(self.metric)
         self._ids = np.empty(64, np.int64)
-        self._size = 0
         self._waiting: deque[tuple[int, float, NDArray[np.float32]]] = deque()
 
     def __len__(self) -> int:
-        return self._size + len(self._waiting)
+        return len(self._rows) + len(self._waiting)
 
     def add(self, id: int, descriptor: NDArray[np.float32], travelled_m: float) -> None:
         """Queue a descriptor met after `travelled_m` of path; minus infinity: enter it at once."""
@@ -134,28 +141,65 @@ class DescriptorIndex:
         while self._waiting and travelled_m - self._waiting[0][1] >= self.delay_m:
             id, _, row = self._waiting.popleft()
             self._insert(id, row)
-        if not self._size:
+        if not len(self._rows):
             return []
-        distance, yaw = self.metric.compare(self.metric.row(descriptor), self._rows[: self._size])
-        # Stable: equal distances come in the order in which they were seen.
-        order = np.argsort(distance, kind='stable')[:count]
+        numbers, distance, yaw = self._rows.search(self.metric.row(descriptor), count)
         return [
-            Match(int(self._ids[i]), float(distance[i]), None if yaw is None else float(yaw[i]))
-            for i in order
-            if np.isfinite(distance[i])
+            Match(int(self._ids[n]), float(d), None if yaw is None else float(yaw[k]))
+            for k, (n, d) in enumerate(zip(numbers, distance, strict=True))
+            if np.isfinite(d)
         ]
 
     def remove(self, id: int) -> None:
         """Forget one keyframe; an unknown id is no error."""
-        keep = np.flatnonzero(self._ids[: self._size] != id)
-        self._rows[: len(keep)] = self._rows[keep]
-        self._ids[: len(keep)] = self._ids[keep]
-        self._size = len(keep)
+        keep = np.flatnonzero(self._ids[: len(self._rows)] != id)
+        if len(keep) < len(self._rows):
+            self._rows.keep(keep)
+            self._ids[: len(keep)] = self._ids[keep]
         self._waiting = deque(entry for entry in self._waiting if entry[0] != id)
 
     def _insert(self, id: int, row: NDArray[np.float32]) -> None:
-        if self._size == len(self._ids):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        if len(self._rows) == len(self._ids):
             self._ids = np.concatenate([self._ids, np.empty_like(self._ids)])
-        self._rows[self._size], self._ids[self._size] = row, id
+        self._ids[len(self._rows)] = id
+        self._rows.add(row)
+
+
+class ComparedRows:
+    """Rows that are all compared with a query, by any metric."""
+
+    def __init__(self, metric: Metric) -> None:
+        self._metric, self._size = metric, 0
+        self._held = np.empty((64, metric.row_length), np.float32)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def add(self, row: NDArray[np.float32]) -> None:
+        """Add a row [row_length]."""
+        if self._size == len(self._held):
+            self._held = np.concatenate([self._held, np.empty_like(self._held)])
+        self._held[self._size] = row
         self._size += 1
+
+    def search(
+        self, row: NDArray[np.float32], count: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return numbers, distances and yaws [K] of the nearest rows, nearest first."""
+        distance, yaw = self._metric.compare(row, self._held[: self._size])
+        # Stable: equal distances come in the order in which they were seen.
+        order = np.argsort(distance, kind='stable')[:count]
+        return order, distance[order], None if yaw is None else yaw[order]
+
+    def keep(self, numbers: NDArray[np.intp]) -> None:
+        """Forget all other rows."""
+        self._held[: len(numbers)] = self._held[numbers]
+        self._size = len(numbers)
+
+
+def _rows(metric: Metric) -> 'ComparedRows | CompactSearch':
+    if not metric.unit_length:
+        return ComparedRows(metric)
+    from lcd_loop_closure.compact_search import CompactSearch  # torch takes seconds
+
+    return CompactSearch(metric.row_length)

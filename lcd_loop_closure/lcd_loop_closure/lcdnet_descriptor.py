@@ -49,6 +49,7 @@ class LcdnetDescriptor:
     """
 
     name = 'lcdnet'
+    unit_length = True
 
     def __init__(
         self, settings: LcdnetDescriptorConfig | None = None, network: Lcdnet | None = None
@@ -65,7 +66,7 @@ class LcdnetDescriptor:
             torch.set_num_threads(s.threads)
         self.network = _load(s.weights, self.device) if network is None else network
         self.network.to(self.device).eval()
-        self._metric = Euclidean(self.length)
+        self._metric = Euclidean(self.length, unit_length=True)
         self._last: tuple[PointCloud, SweepFeatures] | None = None
         self._warned = False
 

@@ -325,9 +325,12 @@ class LoopDetector:
 
     def _features(self, keyframe: Keyframe) -> LocalFeatures | None:
         """Return what registers a keyframe; of a loaded one made from its reduced cloud."""
-        if keyframe.features is None and len(keyframe.cloud):
+        if keyframe.features is not None or not len(keyframe.cloud):
+            return keyframe.features
+        try:
             return self._descriptor.features(keyframe.cloud)
-        return keyframe.features
+        except DataError:
+            return None  # too few points: it is registered without
 
     def _prepared(self, keyframe: Keyframe) -> PreparedCloud:
         prepared = self._ready.pop(keyframe.id, None) or self._pairs.prepare(

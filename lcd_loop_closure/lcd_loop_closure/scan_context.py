@@ -42,6 +42,7 @@ class ScanContext:
     """
 
     name = 'scan_context'
+    unit_length = False
 
     def __init__(self, settings: ScanContextConfig | None = None) -> None:
         self.settings = settings or ScanContextConfig()

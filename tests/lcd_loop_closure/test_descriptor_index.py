@@ -71,3 +71,24 @@ def test_equal_distances_come_in_order_of_sight():
 def test_a_descriptor_of_another_length_is_refused():
     with pytest.raises(DataError, match='expected a descriptor of 256 numbers, got 3'):
         DescriptorIndex(Euclidean(256), 0.0).add(0, np.zeros(3, np.float32), 0.0)
+
+
+def test_unit_vectors_are_searched_compactly_with_the_same_answers():
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(500, 64)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    compact = DescriptorIndex(Euclidean(64, unit_length=True), 10.0)
+    plain = DescriptorIndex(Euclidean(64), 10.0)
+    for i, vector in enumerate(vectors):
+        for index in (compact, plain):
+            index.add(i, vector, float(i))
+    for removed in (3, 77, 495):
+        compact.remove(removed)
+        plain.remove(removed)
+    for query in vectors[::50]:
+        found, expected = (index.nearest(query, 500.0, 5) for index in (compact, plain))
+        assert [match.id for match in found] == [match.id for match in expected]
+        np.testing.assert_allclose(
+            [match.distance for match in found], [match.distance for match in expected], atol=1e-5
+        )
+    assert len(compact) == len(plain) == 497

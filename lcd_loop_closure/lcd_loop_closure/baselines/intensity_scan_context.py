@@ -53,6 +53,7 @@ class IntensityScanContext:
     """
 
     name = 'intensity_scan_context'
+    unit_length = False
 
     def __init__(self, settings: IntensityScanContextConfig | None = None) -> None:
         self.settings = settings or IntensityScanContextConfig()

@@ -63,6 +63,7 @@ class LidarIris:
     """
 
     name = 'lidar_iris'
+    unit_length = False
 
     def __init__(self, settings: LidarIrisConfig | None = None) -> None:
         """Check the settings.

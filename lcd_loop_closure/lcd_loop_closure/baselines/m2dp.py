@@ -43,6 +43,7 @@ class M2dp:
     """
 
     name = 'm2dp'
+    unit_length = False
 
     def __init__(self, settings: M2dpConfig | None = None) -> None:
         self.settings = s = settings or M2dpConfig()
