@@ -1,0 +1,1 @@
+"""Make runs of submaps from the simulator, from any recording, and from the benchmark's files."""
