@@ -26,6 +26,7 @@ from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNodeConfig
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNodeConfig
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNodeConfig
 from lcd_loop_closure.online_map import OnlineMapConfig
+from lcd_loop_closure.place_gate import PlaceGateConfig
 from lcd_loop_closure.robust_solver import RobustSolverConfig
 from lcd_loop_closure.session_anchor import AnchorConfig
 
@@ -46,7 +47,11 @@ def _nodes() -> dict[str, tuple[tuple[type, ...], dict[str, type]]]:
         'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),
         'loop_closure': (
             (LoopClosureNodeConfig,),
-            {'keyframes': KeyframeConfig, **_groups(LoopDetectorSettings())},
+            {
+                'keyframes': KeyframeConfig,
+                'gate': PlaceGateConfig,
+                **_groups(LoopDetectorSettings()),
+            },
         ),
         'pose_graph': (
             (PoseGraphNodeConfig,),

@@ -113,8 +113,9 @@ class LoopDetector:
                 base_link, as on KITTI's car.
             timer: `timer(stage)` is entered around each of the stages describe, retrieve,
                 register, refine and verify.
-            gate: `gate(query, match)` may veto a candidate before registration by returning the
-                reason; None lets it pass (place recognition's uncertainty comes in here).
+            gate: `gate(query, match)` may veto a candidate by descriptor before registration by
+                returning the reason; None lets it pass (place recognition's uncertainty comes in
+                here). Candidates near by the graph do not rest on the look of the place alone.
         """
         self.settings = settings or LoopDetectorSettings()
         s = self.settings
@@ -320,7 +321,7 @@ class LoopDetector:
         if distance is not None and distance > limit:
             reason = f'descriptor distance {distance:.2f} exceeds {limit:g}'
             return PairResult(LoopStatus.REJECTED_DESCRIPTOR, reason)
-        veto = self._gate(query, match) if self._gate else None
+        veto = self._gate(query, match) if self._gate and distance is not None else None
         return None if veto is None else PairResult(LoopStatus.REJECTED_UNCERTAIN, veto)
 
     def _features(self, keyframe: Keyframe) -> LocalFeatures | None:

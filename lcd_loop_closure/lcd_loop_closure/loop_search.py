@@ -37,6 +37,7 @@ class SearchJob:
         sensor_origin: [3] position of the LiDAR in the base frame, metres.
         graph: the pose graph's positions; None before there are any.
         search: False only remembers the keyframe.
+        veto: why its candidates by descriptor are not tried; None when they are.
     """
 
     session: Session
@@ -44,6 +45,7 @@ class SearchJob:
     sensor_origin: NDArray[np.float64]
     graph: GraphPositions | None
     search: bool = True
+    veto: str | None = None
 
 
 class LoopSearch:
@@ -60,6 +62,7 @@ class LoopSearch:
         )
         self._session: Session | None = None
         self._detector: LoopDetector | None = None
+        self._veto: str | None = None
 
     @property
     def size(self) -> int:
@@ -93,11 +96,13 @@ class LoopSearch:
                 descriptor=self._descriptor,
                 sensor_origin=job.sensor_origin,
                 timer=self._timer,
+                gate=lambda query, match: self._veto,
             )
             self._detector.restore(job.session.loaded)
         if not job.search:
             self._detector.remember(job.keyframe)
             return []
+        self._veto = job.veto
         return self._detector.process(job.keyframe, _usable(job))
 
 

@@ -93,18 +93,18 @@ class RadiusSearch:
         at = np.flatnonzero(np.isin(graph.ids, np.asarray(eligible, np.int64)))
         if not len(at) or count < 1:
             return []
-        T_map_query = self._pose(query, keyframes, graph)
+        T_map_query = self.pose(query, keyframes, graph)
         away = np.linalg.norm(graph.xyz[at] - T_map_query[:3, 3], axis=1)
         found = []
         for nearest in np.argsort(away, kind='stable')[:count]:
             if away[nearest] > self.settings.radius:
                 break
             match = keyframes[int(graph.ids[at[nearest]])]
-            T_match_map = se3.inverse(self._pose(match, keyframes, graph))
+            T_match_map = se3.inverse(self.pose(match, keyframes, graph))
             found.append(NearbyKeyframe(match.id, float(away[nearest]), T_match_map @ T_map_query))
         return found
 
-    def _pose(
+    def pose(
         self, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], graph: GraphPositions
     ) -> se3.Array:
         """Return T_map_base of a keyframe, even of one that the graph does not hold yet."""

@@ -144,11 +144,19 @@ def test_a_gate_vetoes_with_its_own_reason(keyframes):
         asked.append((query.id, match.id))
         return 'too uncertain: 0.9 exceeds 0.5'
 
-    detector = LoopDetector(settings(max_distance=2.0), gate=gate)
+    detector = LoopDetector(settings(by_radius=False, max_distance=2.0), gate=gate)
     loops = [loop for keyframe in keyframes[:30] for loop in detector.process(keyframe)]
     assert [(loop.query_id, loop.match_id) for loop in loops] == asked
     assert {loop.status for loop in loops} == {LoopStatus.REJECTED_UNCERTAIN}
     assert {loop.reason for loop in loops} == {'too uncertain: 0.9 exceeds 0.5'}
+
+
+def test_a_gate_is_not_asked_of_what_lies_near_by_the_graph(keyframes):
+    query = keyframes[int(revisits(keyframes, within_m=3.0)[-1])]
+    gated = LoopDetector(settings(by_descriptor=False), gate=lambda query, match: 'no')
+    for keyframe in keyframes[: query.id]:
+        gated.remember(keyframe)
+    assert [loop.status for loop in gated.process(query)][-1] is LoopStatus.ACCEPTED
 
 
 def test_a_loaded_map_is_searched_at_once(keyframes):

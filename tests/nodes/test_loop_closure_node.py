@@ -25,7 +25,7 @@ from lcd_loop_closure.nodes.conversions import keyframe_from_message
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.positions_message import positions_message
 from lcd_loop_closure.scan_context import ScanContext
-from lcd_msgs.msg import Keyframe
+from lcd_msgs.msg import Keyframe, PlaceMatch, PlaceMatchArray
 from lcd_msgs.srv import LoadMap
 
 pytestmark = pytest.mark.ros
@@ -293,3 +293,48 @@ def test_help_names_topics_and_services(node: str) -> None:
     )
     for word in ('Subscribes', 'Publishes', 'Services', 'keyframe', '~/load_map', 'ros2 run'):
         assert word in run.stdout
+
+
+def _place_matches(step: int, probability: float, accepted: bool) -> PlaceMatchArray:
+    match = PlaceMatch(place_id=7, false_match_probability=probability, accepted=accepted)
+    return PlaceMatchArray(header=messages.header(drive.stamp(step), 'lidar'), matches=[match])
+
+
+def test_the_gate_holds_a_keyframe_until_place_recognition_answered(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fed = Fed(
+        make(LoopClosureNode, threaded=False, gate__use=True, gate__wait=0.5, gate__window=0.1)
+    )
+    jobs: list[Any] = []
+
+    def note(job: Any) -> list[Any]:
+        jobs.append((job.keyframe.id, job.veto))
+        return []
+
+    monkeypatch.setattr(fed.node._search, 'run', note)
+    fed.step(0)
+    assert len(fed.keyframes) == 1 and jobs == []  # published at once, searched later
+    fed.lockstep.feed('/place_matches', _place_matches(0, 0.4, False))
+    assert jobs == [
+        (0, 'place recognition does not accept its best match, place 7: 40% likely to be wrong')
+    ]
+    fed.lockstep.feed('/place_matches', _place_matches(3, 0.01, True))  # sooner than the keyframe
+    fed.step(3)
+    fed.lockstep.feed('/place_matches', _place_matches(6, float('nan'), False))  # not calibrated
+    fed.step(6)
+    fed.lockstep.feed('/place_matches', PlaceMatchArray(header=drive.scan(9).header))  # no map yet
+    fed.step(9)
+    assert jobs[1:] == [(1, None), (2, None), (3, None)]
+    for step in range(12, 18):  # place recognition is gone: after half a second it goes on
+        fed.step(step)
+    assert [id for id, _ in jobs] == [0, 1, 2, 3]
+    fed.step(18)
+    assert jobs[4:] == [(4, None)]
+    assert fed.counted('keyframes rejected by place recognition') == 1
+    assert fed.counted('keyframes searched without an answer of place recognition') == 1
+
+
+def test_without_the_gate_place_recognition_is_not_heard(make: Make) -> None:
+    node = make(LoopClosureNode, threaded=False)
+    assert '/place_matches' not in {s.topic_name for s in node.subscriptions}

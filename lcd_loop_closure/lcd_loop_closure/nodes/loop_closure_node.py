@@ -3,7 +3,8 @@
     ros2 run lcd_loop_closure loop_closure --ros-args --params-file config/loop_closure.yaml
 
 Subscribes  points (sensor_msgs/PointCloud2), odom (nav_msgs/Odometry, any source), /tf_static,
-            graph/keyframes (sensor_msgs/PointCloud2: id x y z, from pose_graph; optional)
+            graph/keyframes (sensor_msgs/PointCloud2: id x y z, from pose_graph; optional),
+            place_matches (lcd_msgs/PlaceMatchArray, with gate.use)
 Publishes   keyframe (lcd_msgs/Keyframe), loop_constraint (lcd_msgs/LoopConstraint: every candidate,
             accepted or rejected with the reason), /diagnostics
 Services    ~/load_map (lcd_msgs/LoadMap): look for loops with a saved map, and number on from it
@@ -11,7 +12,9 @@ Services    ~/load_map (lcd_msgs/LoadMap): look for loops with a saved map, and 
 
 Clouds wait for the odometry at their stamp. Keyframes are published at once; the search for loops
 runs beside, and when it cannot keep up, the oldest waiting keyframe is not searched (it stays a
-candidate for later ones). Parameters: see config/loop_closure.yaml or `ros2 param describe`.
+candidate for later ones). With gate.use a keyframe waits for what place recognition says of its
+scan; one that it rejects is not registered with candidates by descriptor. Parameters: see
+config/loop_closure.yaml or `ros2 param describe`.
 """
 
 import os
@@ -41,11 +44,14 @@ from lcd_loop_closure.map_store import load_map
 from lcd_loop_closure.nodes.conversions import keyframe_message, loop_message
 from lcd_loop_closure.nodes.group_parameters import declare_groups
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
+from lcd_loop_closure.nodes.place_verdict import place_verdict
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
+from lcd_loop_closure.place_gate import PlaceGate, PlaceGateConfig, PlaceVerdict
 from lcd_loop_closure.radius_search import GraphPositions
 from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
+from lcd_msgs.msg import PlaceMatchArray
 from lcd_msgs.srv import LoadMap
 
 
@@ -94,6 +100,9 @@ class LoopClosureNode(Node):
         self._buffer: StampBuffer[PointCloud2] = StampBuffer(
             self.config.waiting_clouds, round(self.config.max_odometry_gap * 1e9)
         )
+        self._gate: PlaceGate[SearchJob] = PlaceGate(
+            declare_config(self, PlaceGateConfig, 'gate'), self._search_gated
+        )
         self._graph: GraphPositions | None = None
         self._unsearched: deque[SearchJob] = deque()
         self._frames = ('odom', 'base_link')
@@ -121,6 +130,11 @@ class LoopClosureNode(Node):
         self.create_subscription(
             PointCloud2, 'graph/keyframes', self.on_graph_keyframes, qos.LATCHED
         )
+        if self._gate.settings.use:
+            self.create_subscription(
+                PlaceMatchArray, 'place_matches', self.on_place_matches, qos.RELIABLE
+            )
+            self.diagnostics.watch('keyframes waiting for place recognition', self._gate.__len__)
         self.create_service(LoadMap, '~/load_map', self.on_load_map)
         self.create_service(Trigger, '~/reset', self.on_reset)
         self.diagnostics.watch('clouds waiting for odometry', lambda: len(self._buffer))
@@ -145,6 +159,7 @@ class LoopClosureNode(Node):
             self.diagnostics.tick('odom', pose.stamp_ns)
             self._frames = (message.header.frame_id, message.child_frame_id or 'base_link')
             self._choose(self._buffer.add_pose(pose))
+            self._gate.time(pose.stamp_ns)
 
     def on_graph_keyframes(self, message: PointCloud2) -> None:
         """Remember where the pose graph has the keyframes, for the radius search."""
@@ -152,6 +167,12 @@ class LoopClosureNode(Node):
             self._graph = positions_from_message(message)
         except DataError as error:
             self._reject('graph/keyframes', 'broken', str(error))
+
+    def on_place_matches(self, message: PlaceMatchArray) -> None:
+        """Let the keyframes go on that waited for this answer."""
+        verdict = place_verdict(message)
+        self.diagnostics.tick('place_matches', verdict.stamp_ns)
+        self._gate.answer(verdict)
 
     def on_load_map(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
         """Start a session that continues a saved map."""
@@ -190,6 +211,7 @@ class LoopClosureNode(Node):
             self.get_logger().info(f'{path}: looking for loops with {len(loaded)} keyframes')
         self._session = Session(loaded)
         self._selector.reset()
+        self._gate.clear()
         self._graph = None
 
     def _reset_watches(self) -> None:
@@ -237,7 +259,19 @@ class LoopClosureNode(Node):
         self._keyframes_out.publish(keyframe_message(keyframe, *scan.frames))
         self.diagnostics.tick('keyframe', keyframe.stamp_ns)
         origin = scan.T_base_lidar[:3, 3]
-        self._searches.put(SearchJob(scan.session, keyframe, origin, None))
+        job = SearchJob(scan.session, keyframe, origin, None)
+        if self._gate.settings.use:
+            self._gate.hold(keyframe.stamp_ns, job)
+        else:
+            self._searches.put(job)
+
+    def _search_gated(self, job: SearchJob, verdict: PlaceVerdict | None) -> None:
+        if verdict is None:
+            self.diagnostics.count('keyframes searched without an answer of place recognition')
+        elif verdict.rejected is not None:
+            self.diagnostics.count('keyframes rejected by place recognition')
+            job = replace(job, veto=verdict.rejected)
+        self._searches.put(job)
 
     def _skip(self, job: SearchJob) -> None:
         self.diagnostics.count('dropped searches: machine too slow')
