@@ -27,7 +27,11 @@ setup(
         'torch',
         'tqdm',
     ],
-    extras_require={'test': ['pytest']},
+    extras_require={
+        'faiss': ['faiss-cpu'],
+        'qdrant': ['qdrant-client'],
+        'test': ['pytest'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

@@ -1,0 +1,1 @@
+"""Find the places of a map whose descriptors are most alike."""
