@@ -21,6 +21,7 @@ setup(
     # because pip would look for packages of these names elsewhere.
     install_requires=[
         'filterpy',
+        'numba',
         'numpy',
         'safetensors',
         'scipy',

@@ -1,0 +1,1 @@
+"""See a point cloud map as a camera would: projection, z-buffer, occlusion filter."""
