@@ -1,0 +1,72 @@
+"""Know where the pose graph has the keyframes, orientation included."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from lcd_common import se3
+from lcd_common.cloud import PointCloud
+from lcd_loop_closure.keyframes import Keyframe
+from lcd_loop_closure.radius_search import GraphPositions, RadiusSearch
+from uncertain_place_recognition.place import Place
+
+_MOVED_M = 0.05
+
+
+class KeyframePoses:
+    """Follow the graph's positions; they bring no orientation, which odometry has, turned with it.
+
+    Keyframes of a loaded map come from another odometry than those of this session: each side is
+    aligned for itself (`RadiusSearch.pose`).
+    """
+
+    def __init__(self, loaded: Iterable[Place] = ()) -> None:
+        """Start a session; `loaded` are the places of the map that it continues."""
+        self._loaded = {p.id: _keyframe(p.id, p.stamp_ns, p.T_map_base) for p in loaded}
+        self._session: dict[int, Keyframe] = {}
+        self._search = RadiusSearch()
+        self._graph: GraphPositions | None = None
+        self._seen: dict[int, se3.Array] = {}
+
+    @property
+    def located(self) -> bool:
+        """Tell whether the graph knows where this session lies in the loaded map."""
+        if not self._loaded:
+            return True
+        return self._graph is not None and any(int(i) in self._session for i in self._graph.ids)
+
+    def add(self, id: int, stamp_ns: int, T_odom_base: se3.Array) -> None:
+        """Take in a keyframe of this session."""
+        self._session[id] = _keyframe(id, stamp_ns, T_odom_base)
+
+    def pose(self, id: int) -> se3.Array | None:
+        """Return T_map_base of a keyframe; None when it is unknown or the session not located."""
+        keyframes = self._session if id in self._session else self._loaded
+        keyframe = keyframes.get(id)
+        if keyframe is None or not self.located:
+            return None
+        if self._graph is None:
+            return keyframe.T_odom_base
+        return self._search.pose(keyframe, keyframes, self._graph)
+
+    def corrected(self, graph: GraphPositions) -> dict[int, se3.Array]:
+        """Take in the graph's positions; return T_map_base by id of the keyframes that moved."""
+        self._graph = graph
+        moved = {}
+        for id, xyz in zip(graph.ids.tolist(), graph.xyz, strict=True):
+            if id not in self._session and id not in self._loaded:
+                continue
+            last = self._seen.get(id)
+            if last is None or float(np.abs(xyz - last).max()) > _MOVED_M:
+                self._seen[id] = xyz
+                T_map_base = self.pose(id)
+                if T_map_base is not None:
+                    moved[id] = T_map_base
+        return moved
+
+
+def _keyframe(id: int, stamp_ns: int, T_odom_base: se3.Array) -> Keyframe:
+    return Keyframe(id, stamp_ns, T_odom_base, np.eye(4), None, _NO_POINTS)
+
+
+_NO_POINTS = PointCloud(np.empty((0, 3), np.float32))
