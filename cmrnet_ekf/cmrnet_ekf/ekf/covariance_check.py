@@ -11,7 +11,7 @@ def used_covariance(covariance: se3.Array, axes: NDArray[np.bool_], what: str) -
     """Return a covariance whose used rows are good; the unused ones become 1 and independent.
 
     Drivers put anything into the rows of what they do not measure (-1, zeros, 1e9), so only the
-    used ones are judged. Nothing is mended: a driver that sends a broken one is wrong elsewhere too.
+    used ones are judged. Nothing is mended: a driver that sends a broken one is wrong elsewhere.
 
     Args:
         covariance: [n x n].

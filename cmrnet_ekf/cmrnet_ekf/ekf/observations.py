@@ -61,6 +61,11 @@ class PoseObservation:
     axes: Axes = ALL6
     correlation_s: float = 0.0
 
+    @property
+    def numbers(self) -> se3.Array:
+        """What was observed."""
+        return self.T_map_sensor
+
     def innovation(self, state: MotionState) -> Innovation:
         """Compare with a state."""
         R_sensor = state.R @ self.T_body_sensor[:3, :3]
@@ -90,6 +95,11 @@ class RelativeObservation:
     T_body_sensor: se3.Array = field(default_factory=lambda: _HERE)
     axes: Axes = ALL6
     correlation_s: float = 0.0
+
+    @property
+    def numbers(self) -> se3.Array:
+        """What was observed."""
+        return self.T_from_to
 
     def innovation(self, state: MotionState) -> Innovation:
         """Compare with a state that carries the clone of the earlier pose."""
@@ -139,6 +149,11 @@ class TwistObservation:
     correlation_s: float = 0.0
     gyroscope_variance: float = 0.0
 
+    @property
+    def numbers(self) -> se3.Array:
+        """What was observed."""
+        return self.twist
+
     def innovation(self, state: MotionState) -> Innovation:
         """Compare with a state."""
         R_body, arm = self.T_body_sensor[:3, :3], self.T_body_sensor[:3, 3]
@@ -171,6 +186,11 @@ class PositionObservation:
     position_body: se3.Array = field(default_factory=lambda: np.zeros(3))
     axes: Axes = ALL3
     correlation_s: float = 0.0
+
+    @property
+    def numbers(self) -> se3.Array:
+        """What was observed."""
+        return self.position_map
 
     def innovation(self, state: MotionState) -> Innovation:
         """Compare with a state."""

@@ -53,20 +53,21 @@ class Propagation:
         turn = (state.turn_rate - state.gyroscope_bias).tolist()
         force = (state.force - state.accelerometer_bias).tolist()
         D = _rotation(turn, dt)
-        v_and_p = state.R.dot(_gained(turn, force, dt))
+        gained_v, gained_p = _gained(turn, force, dt)
+        v_and_p = state.R.dot(np.array((gained_v, gained_p)).T)
         F = self._F
         Dt = D.T
-        B = Dt.dot(_hat(force, -dt))
+        B = Dt.dot(_hat(force, dt))
         F[0:3, 0:3] = F[3:6, 3:6] = F[6:9, 6:9] = Dt
         F[0:3, 6:9] = dt * Dt
-        F[0:3, 3:6] = (0.5 * dt) * B
-        F[6:9, 3:6] = B
+        F[0:3, 3:6] = Dt.dot(_hat(gained_p, -1.0))
+        F[6:9, 3:6] = Dt.dot(_hat(gained_v, -1.0))
         if self.settings.estimate_biases:
-            F[3:6, 9:12] = _bias_turn(turn, dt)
-            F[6:9, 9:12] = (-0.5 * dt) * B
-            F[0:3, 9:12] = (-dt * dt / 6.0) * B
-            F[6:9, 12:15] = (-dt) * Dt
-            F[0:3, 12:15] = (-0.5 * dt * dt) * Dt
+            F[3:6, 9:12] = J = _bias_turn(turn, dt)
+            F[6:9, 9:12] = (0.5 * dt) * B
+            F[0:3, 9:12] = (dt * dt / 6.0) * B
+            F[6:9, 12:15] = C = Dt.dot(J.T)
+            F[0:3, 12:15] = (0.5 * dt) * C
         P = self._moved(state.covariance)
         s = self.settings
         self._add_noise(P, dt, s.accelerometer_noise**2, s.gyroscope_noise**2)
@@ -157,8 +158,8 @@ def _rotation(turn: list[float], dt: float) -> se3.Array:
     )
 
 
-def _gained(turn: list[float], force: list[float], dt: float) -> se3.Array:
-    """Return velocity and way [3 x 2] that a sample adds in the axes at its start.
+def _gained(turn: list[float], force: list[float], dt: float) -> tuple[list[float], list[float]]:
+    """Return velocity [3] and way [3] that a sample adds, in the axes at its start.
 
     Exact but for (turn rate dt)^2.
     """
@@ -166,13 +167,9 @@ def _gained(turn: list[float], force: list[float], dt: float) -> se3.Array:
     fx, fy, fz = force
     cx, cy, cz = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx
     h, q, t = 0.5 * dt * dt, dt**3 / 6.0, dt
-    return np.array(
-        (
-            (t * fx + h * cx, h * fx + q * cx),
-            (t * fy + h * cy, h * fy + q * cy),
-            (t * fz + h * cz, h * fz + q * cz),
-        )
-    )
+    velocity = [t * fx + h * cx, t * fy + h * cy, t * fz + h * cz]
+    way = [h * fx + q * cx, h * fy + q * cy, h * fz + q * cz]
+    return velocity, way
 
 
 def _bias_turn(turn: list[float], dt: float) -> se3.Array:

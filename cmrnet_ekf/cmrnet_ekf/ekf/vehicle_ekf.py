@@ -116,13 +116,12 @@ class VehicleEkf:
         )
         self._history = History(state, round(self.settings.history.length * 1e9))
         # The sample that held at the stamp, and those since.
-        before = [sample for sample in self._early if sample[0] <= stamp_ns][-1:]
-        after = [sample for sample in self._early if sample[0] > stamp_ns]
-        for at_ns, turn_rate, force in before:
-            at_start = replace(state, turn_rate=turn_rate, force=force, imu_ns=at_ns)
-            self._history = History(at_start, round(self.settings.history.length * 1e9))
-        for sample in after:
-            self._put_sample(*sample)
+        for at_ns, turn_rate, force in sorted(self._early, key=lambda sample: sample[0]):
+            if at_ns <= stamp_ns:
+                state = replace(state, turn_rate=turn_rate, force=force, imu_ns=at_ns)
+                self._history = History(state, round(self.settings.history.length * 1e9))
+            elif at_ns != self._history.newest.imu_ns:
+                self._put_sample(at_ns, turn_rate, force)
 
     def reset(self) -> None:
         """Forget everything; nothing happens until the next start."""
@@ -138,9 +137,7 @@ class VehicleEkf:
         total = float(turn_rate[0] + turn_rate[1] + turn_rate[2])
         total += float(force[0] + force[1] + force[2])
         if total - total != 0.0:
-            raise DataError(
-                'imu: expected finite turn rates and accelerations, got NaN or infinity'
-            )
+            raise DataError('imu: expected finite rates and accelerations, got NaN or infinity')
         if self._early and stamp_ns == self._early[-1][0]:
             raise DataError(f'imu: a sample repeats the stamp {stamp_ns}')
         self._early.append((stamp_ns, turn_rate, force))
@@ -245,13 +242,9 @@ class VehicleEkf:
 
 
 def _checked(seen: Observation) -> Observation:
-    numbers = [getattr(seen, name) for name in ('T_map_sensor', 'T_from_to', 'twist', 'position_map')
-               if hasattr(seen, name)]  # fmt: skip
     axes = np.array(seen.axes)
-    for values in numbers:
-        finite = np.isfinite(values if np.ndim(values) == 2 else values[axes])
-        if not finite.all():
-            raise DataError(f'{seen.source}: expected finite numbers, got NaN or infinity')
+    if not np.isfinite(seen.numbers[axes] if seen.numbers.ndim == 1 else seen.numbers).all():
+        raise DataError(f'{seen.source}: expected finite numbers, got NaN or infinity')
     if isinstance(seen, RelativeObservation) and seen.from_ns >= seen.stamp_ns:
         raise DataError(f'{seen.source}: a motion must end after it begins')
     if seen.axes == ALL6 or len(seen.axes) == 3:
