@@ -86,7 +86,16 @@ class EmbeddingEnsemble:
 
     @property
     def submap(self) -> SubmapConfig:
-        """How the submaps were made that the members were trained on."""
+        """How the submaps were made that the members were trained on.
+
+        Raises:
+            ConfigError: they are the benchmark's, which no live sweep is like.
+        """
+        if self.facts.get('normalisation') == 'benchmark':
+            raise ConfigError(
+                'these weights know the submaps of the PointNetVLAD benchmark alone, which have no '
+                'metric scale; live sweeps need weights trained on metric submaps'
+            )
         return SubmapConfig(**self.facts.get('submap', {}))
 
     def embed(self, points: NDArray[np.float32]) -> NDArray[np.float32]:

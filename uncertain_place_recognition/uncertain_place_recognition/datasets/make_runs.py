@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,9 @@ def _run_of(source: str, maker: SubmapMaker, arguments: argparse.Namespace, bar:
 def _with_facts(
     made: SubmapRun, settings: SubmapConfig, arguments: argparse.Namespace
 ) -> SubmapRun:
-    facts = {'spacing_m': arguments.spacing, 'reach_m': settings.reach, **made.facts}
+    if made.facts.get('normalisation') == 'benchmark':
+        return made
+    facts = {**made.facts, 'spacing_m': arguments.spacing, 'submap': asdict(settings)}
     return SubmapRun(made.name, made.world, made.stamps_ns, made.T_world_base, made.points, facts)
 
 

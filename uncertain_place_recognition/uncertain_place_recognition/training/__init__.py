@@ -1,0 +1,4 @@
+"""Train teachers, students and their rivals on runs of submaps.
+
+Once the runs are made only torch, numpy, scipy and safetensors are needed.
+"""
