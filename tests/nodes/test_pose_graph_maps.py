@@ -80,6 +80,24 @@ def test_a_person_says_where_the_vehicle_is(make: Make, tmp_path: Path) -> None:
     assert fed.counted('rejected initialpose: not needed') == 1
 
 
+def test_an_initial_pose_belongs_to_its_stamp(make: Make, tmp_path: Path) -> None:
+    fed = Fed(make(PoseGraphNode, threaded=False))
+    fed.drive(range(4))
+    _finished(
+        fed.node.map_services.on_save_map(
+            SaveMap.Request(path=str(tmp_path / 'map')), SaveMap.Response()
+        )
+    )
+    fed.node.map_services.on_load_map(
+        LoadMap.Request(path=str(tmp_path / 'map')), LoadMap.Response()
+    )
+    fed.drive(range(10, 14), first_id=0)
+    pose = PoseWithCovarianceStamped(header=messages.header(drive.stamp(11), 'map'))
+    pose.pose.pose = messages.pose_message(drive.true_pose(11))  # where it was two steps ago
+    fed.feed('initialpose', pose)
+    np.testing.assert_allclose(fed.path()[-1], drive.true_pose(13), atol=1e-6)
+
+
 def test_saving_and_loading_answer_what_went_wrong(make: Make, tmp_path: Path) -> None:
     node = make(PoseGraphNode, threaded=False)
     (answer,) = _finished(

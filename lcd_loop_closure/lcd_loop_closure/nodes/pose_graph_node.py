@@ -5,7 +5,7 @@
 Subscribes  keyframe (lcd_msgs/Keyframe), loop_constraint (lcd_msgs/LoopConstraint), odom
             (nav_msgs/Odometry), /tf_static, gps/fix (sensor_msgs/NavSatFix, with use_gps), imu
             (sensor_msgs/Imu, with use_imu), initialpose (geometry_msgs/PoseWithCovarianceStamped:
-            where a session starts in a loaded map)
+            where a session starts in a loaded map, at its stamp; from RViz or place_recognition)
 Publishes   /tf map -> odom (with publish_tf), pose (geometry_msgs/PoseWithCovarianceStamped, at
             odometry's rate), path (nav_msgs/Path), graph/keyframes (sensor_msgs/PointCloud2: x y z
             id), loops (lcd_msgs/LoopConstraintArray: every loop with the latest verdict),
@@ -22,6 +22,7 @@ config/pose_graph.yaml or `ros2 param describe`.
 
 import math
 import time
+from collections import OrderedDict
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -38,7 +39,6 @@ from lcd_common.nodes.parameters import declare_config
 from lcd_common.nodes.spin import run_node
 from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.settings import config, setting
-from lcd_common.stamp_buffer import StampedPose
 from lcd_loop_closure.graph_noise import GraphNoise
 from lcd_loop_closure.graph_settings import GraphSettings
 from lcd_loop_closure.keyframes import Keyframe
@@ -61,6 +61,8 @@ from lcd_loop_closure.robust_solver import RobustSolverConfig, Verdict
 from lcd_loop_closure.session_anchor import AnchorConfig
 from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
+
+_RECENT = 100  # odometry messages that an initial pose may refer to
 
 
 @config
@@ -151,7 +153,7 @@ class PoseGraphNode(Node):
         )
         self.paused = False
         self.base_frame = 'base_link'
-        self._odometry: StampedPose | None = None
+        self._recent: OrderedDict[int, se3.Array] = OrderedDict()  # T_odom_base by stamp
         self._shown_s = self._mapped_s = self._judged_s = -math.inf
         self._refreshed_at: Keyframe | None = None
         self._undrawn = self._unmapped = False
@@ -231,13 +233,15 @@ class PoseGraphNode(Node):
         if not self._watch_odom.takes(pose.stamp_ns):
             return
         self.diagnostics.tick('odom', pose.stamp_ns)
-        self._odometry = pose
+        self._recent[pose.stamp_ns] = pose.T_odom_base
+        while len(self._recent) > _RECENT:
+            self._recent.popitem(last=False)
         self._sensors.add_odometry(pose)
         self._pose.publish(pose, self.map)
 
     def on_initialpose(self, message: PoseWithCovarianceStamped) -> None:
-        """Attach a new session to the loaded map where a person says that the vehicle is."""
-        if self.map.located or self._odometry is None:
+        """Attach a new session to the loaded map where somebody says that the vehicle is or was."""
+        if self.map.located or not self._recent:
             self._reject('initialpose', 'not needed', 'initialpose: no session waits for its place')
             return
         try:
@@ -245,7 +249,10 @@ class PoseGraphNode(Node):
         except DataError as error:
             self._reject('initialpose', 'broken', str(error))
             return
-        self.map.place(T_map_base @ se3.inverse(self._odometry.T_odom_base))
+        stamp_ns = messages.stamp_ns(message.header.stamp)
+        # A stamp that odometry does not know (zero, another clock) means now.
+        T_odom_base = self._recent.get(stamp_ns, next(reversed(self._recent.values())))
+        self.map.place(T_map_base @ se3.inverse(T_odom_base))
         self.update()
 
     def restart(self, path: str) -> None:
@@ -345,7 +352,7 @@ class PoseGraphNode(Node):
         """Forget odometry: the clock jumped back. The map waits for what loop_closure does."""
         self._pose.forget()
         self._sensors.rewind(stamp_ns)
-        self._odometry = None
+        self._recent.clear()
 
     def _on_verdict(self, graph: PoseGraph, verdict: Verdict) -> None:
         if graph is not self.map.graph:
