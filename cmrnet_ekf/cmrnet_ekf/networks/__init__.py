@@ -1,0 +1,1 @@
+"""CMRNet and its uncertain variants (thesis chapter 5)."""

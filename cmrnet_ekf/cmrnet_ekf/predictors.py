@@ -1,0 +1,149 @@
+"""Predict poses with uncertainty: one network, MC dropout, a deep ensemble, or evidence."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cmrnet_ekf import euler
+from cmrnet_ekf.networks.checkpoint import load_network
+from cmrnet_ekf.networks.cmrnet import Cmrnet
+from cmrnet_ekf.networks.config import CmrnetConfig
+from cmrnet_ekf.networks.outputs import Evidence, GaussianPose, Output, QuaternionPose
+from cmrnet_ekf.pose_belief import PoseBelief, gaussian_of_samples
+from lcd_common.errors import ConfigError, DataError
+from lcd_common.se3 import Array
+
+
+class Predictor:
+    """Say where cameras are; what `belief` makes of the networks depends on what they are.
+
+    One network with a quaternion head and dropout is asked many times (MC dropout), several are an
+    ensemble, an evidential or covariance head speaks for itself. One plain network alone gives a
+    scale of 0: it does not know.
+    """
+
+    def __init__(self, networks: Sequence[Cmrnet], samples: int = 30, seed: int = 0) -> None:
+        """Take networks that see the same images.
+
+        Args:
+            networks: one, or the members of an ensemble.
+            samples: draws of MC dropout; 1 and less: no dropout.
+            seed: of the draws; the same images give the same belief.
+
+        Raises:
+            ConfigError: there are none, or they do not fit together.
+        """
+        if not networks:
+            raise ConfigError('expected at least one network')
+        inputs = {_input(network.settings) for network in networks}
+        if len(inputs) > 1:
+            raise ConfigError('the members of an ensemble must see the same images')
+        if len(networks) > 1 and any(n.settings.head != 'quaternion' for n in networks):
+            raise ConfigError('an ensemble is made of networks with quaternion heads (thesis: DE)')
+        self.networks = [network.eval() for network in networks]
+        self.settings = networks[0].settings
+        self._samples, self._seed = samples, seed
+
+    @classmethod
+    def load(cls, path: Path, device: torch.device | str = 'cpu', samples: int = 30) -> 'Predictor':
+        """Read a network, or all networks of a folder as an ensemble.
+
+        Raises:
+            DataError: there are none, or a file holds none.
+        """
+        files = sorted(path.glob('*.safetensors')) if path.is_dir() else [path]
+        if not files or not files[0].is_file():
+            raise DataError(f'{path}: expected a .safetensors file or a folder of them, found none')
+        return cls([load_network(file, device)[0] for file in files], samples)
+
+    @property
+    def kind(self) -> str:
+        """What this is: plain, mcd, de, der or covariance."""
+        if self.settings.head != 'quaternion':
+            return {'evidential': 'der', 'covariance': 'covariance'}[self.settings.head]
+        if len(self.networks) > 1:
+            return 'de'
+        return 'mcd' if self.settings.dropout > 0 and self._samples > 1 else 'plain'
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are."""
+        return next(self.networks[0].parameters()).device
+
+    @torch.no_grad()
+    def belief(self, image: Tensor, lidar: Tensor) -> PoseBelief:
+        """Return what the networks believe of images [B x 3 x H x W] and LiDAR images [B x H x W].
+
+        See `Cmrnet.trunk`. MC dropout uses one pass through the trunk.
+        """
+        image, lidar = image.to(self.device), lidar.to(self.device)
+        kind = self.kind
+        if kind == 'de':
+            return gaussian_of_samples(
+                np.stack([means(network(image, lidar)) for network in self.networks])
+            )
+        network = self.networks[0]
+        features = network.trunk(image, lidar)
+        if kind == 'mcd':
+            return gaussian_of_samples(self._draws(network, features))
+        output = network.head(features)
+        if isinstance(output, Evidence):
+            return _student_t(output)
+        if isinstance(output, GaussianPose):
+            return _correlated(output)
+        mean = means(output)
+        nothing = np.zeros_like(mean)
+        return PoseBelief(mean, nothing, np.full_like(mean, np.inf), nothing)
+
+    def _draws(self, network: Cmrnet, features: Tensor) -> Array:
+        """Return sampled components [S x B x 6] of features [B x F]."""
+        count, batch = self._samples, len(features)
+        devices = [features.device] if features.device.type == 'cuda' else []
+        with torch.random.fork_rng(devices=devices):
+            torch.manual_seed(self._seed)
+            network.head.dropout.train()
+            try:
+                output = network.head(features.repeat(count, 1))
+            finally:
+                network.head.dropout.eval()
+        return means(output).reshape(count, batch, 6)
+
+
+def means(output: Output) -> Array:
+    """Return the components [B x 6] that an output holds for the likeliest."""
+    if isinstance(output, QuaternionPose):
+        angles = euler.euler_of_quaternion(output.quaternion)
+        mean = torch.cat([output.translation, angles], 1)
+    elif isinstance(output, Evidence):
+        mean = output.gamma
+    else:
+        mean = output.mean
+    return mean.detach().double().cpu().numpy()
+
+
+def _student_t(evidence: Evidence) -> PoseBelief:
+    scale, freedom, epistemic = (
+        values.detach().double().cpu().numpy()
+        for values in (
+            evidence.squared_scale.sqrt(),
+            evidence.degrees_of_freedom,
+            evidence.epistemic_variance,
+        )
+    )
+    return PoseBelief(means(evidence), scale, freedom, epistemic)
+
+
+def _correlated(pose: GaussianPose) -> PoseBelief:
+    root = pose.information_root.detach().double().cpu().numpy()
+    covariance = np.linalg.inv(root @ np.swapaxes(root, 1, 2))
+    scale = np.sqrt(np.einsum('nii->ni', covariance))
+    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+    nothing = np.zeros_like(scale)
+    return PoseBelief(means(pose), scale, np.full_like(scale, np.inf), nothing, correlation)
+
+
+def _input(s: CmrnetConfig) -> tuple[int | float | bool, ...]:
+    return s.width, s.height, s.focal, s.centred, s.occlusion_radius, s.occlusion_threshold
