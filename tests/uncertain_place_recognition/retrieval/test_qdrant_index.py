@@ -57,7 +57,7 @@ def test_a_collection_of_another_kind_is_refused(tmp_path):
 
 
 def test_a_server_that_is_away_is_one_line():
-    with pytest.raises(MapError, match='127.0.0.1:9 does not answer') as raised:
+    with pytest.raises(MapError, match=r'127\.0\.0\.1:9 does not answer') as raised:
         QdrantIndex(2, settings=QdrantConfig(url='http://127.0.0.1:9', timeout=1))
     assert '\n' not in str(raised.value)
 
