@@ -44,7 +44,9 @@ class PoseBelief:
         """Covariance [N x 6 x 6] of the components."""
         deviation = np.sqrt(self.variance)
         correlation = np.eye(6) if self.correlation is None else self.correlation
-        return deviation[:, :, None] * correlation * deviation[:, None, :]
+        with np.errstate(invalid='ignore'):
+            covariance = deviation[:, :, None] * correlation * deviation[:, None, :]
+        return np.where(correlation == 0.0, 0.0, covariance)  # infinity times 0 too
 
     @property
     def transforms(self) -> Array:

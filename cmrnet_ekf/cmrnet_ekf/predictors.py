@@ -10,7 +10,6 @@ from torch import Tensor
 from cmrnet_ekf import euler
 from cmrnet_ekf.networks.checkpoint import load_network
 from cmrnet_ekf.networks.cmrnet import Cmrnet
-from cmrnet_ekf.networks.config import CmrnetConfig
 from cmrnet_ekf.networks.outputs import Evidence, GaussianPose, Output, QuaternionPose
 from cmrnet_ekf.pose_belief import PoseBelief, gaussian_of_samples
 from lcd_common.errors import ConfigError, DataError
@@ -38,8 +37,7 @@ class Predictor:
         """
         if not networks:
             raise ConfigError('expected at least one network')
-        inputs = {_input(network.settings) for network in networks}
-        if len(inputs) > 1:
+        if len({network.settings.images for network in networks}) > 1:
             raise ConfigError('the members of an ensemble must see the same images')
         if len(networks) > 1 and any(n.settings.head != 'quaternion' for n in networks):
             raise ConfigError('an ensemble is made of networks with quaternion heads (thesis: DE)')
@@ -143,7 +141,3 @@ def _correlated(pose: GaussianPose) -> PoseBelief:
     correlation = covariance / (scale[:, :, None] * scale[:, None, :])
     nothing = np.zeros_like(scale)
     return PoseBelief(means(pose), scale, np.full_like(scale, np.inf), nothing, correlation)
-
-
-def _input(s: CmrnetConfig) -> tuple[int | float | bool, ...]:
-    return s.width, s.height, s.focal, s.centred, s.occlusion_radius, s.occlusion_threshold

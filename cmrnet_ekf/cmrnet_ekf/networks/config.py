@@ -57,6 +57,12 @@ class CmrnetConfig:
         return self
 
     @property
+    def images(self) -> tuple[float, ...]:
+        """What says which images the network sees: size, scale and place, filter, depth."""
+        filter_ = self.occlusion_radius, self.occlusion_threshold
+        return self.width, self.height, self.focal, self.centred, *filter_, self.max_depth
+
+    @property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of the last level."""
         step = 2 ** len(self.pyramid)
