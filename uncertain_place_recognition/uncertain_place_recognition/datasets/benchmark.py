@@ -18,8 +18,9 @@ from uncertain_place_recognition.runs import SubmapRun
 
 POINTS = 4096
 _BYTES = POINTS * 3 * 8
-# Normalised submaps lie within 1; float32 read as float64 is near 1e38 or 1e-38.
-_LARGEST = 2.0
+# Normalised submaps lie within 1, 0.5 from their middle in the mean. Pairs of float32 numbers read as
+# float64 are near zero, metres are far outside.
+_LARGEST, _LEAST_SPREAD = 1.5, 0.05
 
 
 def read_benchmark_submap(path: Path) -> NDArray[np.float32]:
@@ -41,10 +42,12 @@ def read_benchmark_submap(path: Path) -> NDArray[np.float32]:
         )
     points = np.frombuffer(raw, '<f8').reshape(POINTS, 3)
     size = float(np.abs(points).max()) if np.isfinite(points).all() else float('inf')
-    if not 1e-6 < size < _LARGEST:
+    spread = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean()) if size < 1e9 else 0
+    if size > _LARGEST or spread < _LEAST_SPREAD:
         raise DataError(
-            f'{path}: expected float64 coordinates within -1 .. 1, the largest is {size:.3g}; is '
-            'the file float32, or not normalised?'
+            f'{path}: expected float64 coordinates within -1 .. 1, about 0.5 from their middle; '
+            f'the largest is {size:.3g}, the mean {spread:.3g} from it; is the file float32, or '
+            'not normalised?'
         )
     return points.astype(np.float32)
 
