@@ -1,5 +1,6 @@
 """Track a vehicle in six degrees of freedom: inertial samples move it, observations correct it."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -134,9 +135,7 @@ class VehicleEkf:
         Raises:
             DataError: it is not finite, repeats a stamp or is older than the history.
         """
-        total = float(turn_rate[0] + turn_rate[1] + turn_rate[2])
-        total += float(force[0] + force[1] + force[2])
-        if total - total != 0.0:
+        if not math.isfinite(sum(turn_rate.tolist()) + sum(force.tolist())):
             raise DataError('imu: expected finite rates and accelerations, got NaN or infinity')
         if self._early and stamp_ns == self._early[-1][0]:
             raise DataError(f'imu: a sample repeats the stamp {stamp_ns}')

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from cmrnet_ekf.ekf.motion_state import SIZE, MotionState, corrected
 
+from cmrnet_ekf.ekf.motion_state import SIZE, MotionState, corrected
 from lcd_common import se3
 
 
@@ -33,9 +33,8 @@ def moved(state: MotionState, error: se3.Array) -> MotionState:
 def error_between(true: MotionState, state: MotionState) -> se3.Array:
     """Return the error [15] of a state, written down independently of `corrected`."""
     xi = se3.log(se3.inverse(state.T_map_body) @ true.T_map_body)
-    columns = []
-    for axis in np.eye(3):  # the left Jacobian, column by column
-        columns.append(se3.exp(np.concatenate([axis, xi[3:]]))[:3, 3])
+    # The left Jacobian, column by column.
+    columns = [se3.exp(np.concatenate([axis, xi[3:]]))[:3, 3] for axis in np.eye(3)]
     nu = np.linalg.solve(np.array(columns).T, state.R.T @ (true.v - state.v))
     return np.concatenate(
         [

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from moving_states import moved, random_state
+
 from cmrnet_ekf.ekf.motion_state import MotionState, cloned
 from cmrnet_ekf.ekf.observations import (
     Observation,
@@ -13,8 +15,6 @@ from cmrnet_ekf.ekf.observations import (
     RelativeObservation,
     TwistObservation,
 )
-from moving_states import moved, random_state
-
 from lcd_common import se3
 
 Maker = Callable[[MotionState, np.random.Generator], Observation]

@@ -5,11 +5,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from moving_states import drive, error_between, moved, random_state
+
 from cmrnet_ekf.ekf.ekf_settings import MotionConfig
 from cmrnet_ekf.ekf.motion_state import SIZE, MotionState, cloned
 from cmrnet_ekf.ekf.propagation import Propagation
-from moving_states import drive, error_between, moved, random_state
-
 from lcd_common import se3
 
 _TEN_MS = 10_000_000

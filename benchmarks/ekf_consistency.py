@@ -1,0 +1,193 @@
+"""Measure whether the vehicle's EKF is as wrong as it says, over Monte-Carlo runs."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.ekf_drive import ImuRecord, ReferenceDrive, reference_drive, sense
+from cmrnet_ekf.ekf.consistency import anees, autocorrelation, nees
+from cmrnet_ekf.ekf.ekf_settings import EkfSettings, GateConfig, MotionConfig, StartConfig
+from cmrnet_ekf.ekf.observations import (
+    Observation,
+    PoseObservation,
+    PositionObservation,
+    TwistObservation,
+)
+from cmrnet_ekf.ekf.update import Verdict
+from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
+from lcd_common import se3
+
+MOTION = MotionConfig(
+    accelerometer_noise=0.02, gyroscope_noise=1e-3, accelerometer_walk=1e-3, gyroscope_walk=1e-5
+)
+START = StartConfig(
+    position=0.5, rotation=0.03, velocity=0.5, gyroscope_bias=0.01, accelerometer_bias=0.1
+)
+CAMERA_SIGMAS = np.array([0.25, 0.12, 0.10, 0.005, 0.005, 0.008])
+GNSS_SIGMAS = np.array([1.5, 1.5, 3.0])
+ANTENNA = np.array([-0.5, 0.3, 1.2])
+SPEED_SIGMA = 0.1
+_SETTLING_S = 2.0
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors of a real camera localization, in place of simulated ones.
+
+    Attributes:
+        xi: [sequences x N x 6], T_true = T_observed exp(xi), in the order in which they came.
+        covariances: [sequences x N x 6 x 6] that came with them.
+        correlation_s: what the filter is told of their correlation.
+    """
+
+    xi: se3.Array
+    covariances: se3.Array
+    correlation_s: float = 0.0
+
+
+@dataclass
+class RunRecord:
+    """What one run said."""
+
+    nees: list[float] = field(default_factory=list)
+    verdicts: dict[str, list[Verdict]] = field(default_factory=lambda: defaultdict(list))
+
+
+def observations(
+    drive: ReferenceDrive, rng: np.random.Generator, camera: CameraErrors | None = None
+) -> Iterator[Observation]:
+    """Yield what camera (10 Hz), wheels (10 Hz) and GNSS (1 Hz) see, in the order of stamps."""
+    sequence = None
+    if camera is not None:
+        sequence = rng.integers(len(camera.xi)), rng.integers(camera.xi.shape[1])
+    seen = 0
+    for k in range(0, len(drive.stamps_ns), 5):
+        stamp_ns, T = int(drive.stamps_ns[k]), drive.T_map_body[k]
+        if k % 10 == 0:
+            xi, covariance = rng.normal(size=6) * CAMERA_SIGMAS, np.diag(CAMERA_SIGMAS**2)
+            if camera is not None and sequence is not None:
+                at = (sequence[1] + seen) % camera.xi.shape[1]
+                xi, covariance = camera.xi[sequence[0], at], camera.covariances[sequence[0], at]
+            seen += 1
+            # T_true = T_observed exp(xi)
+            yield PoseObservation(
+                stamp_ns,
+                'camera',
+                T @ se3.exp(-xi),
+                covariance,
+                correlation_s=0.0 if camera is None else camera.correlation_s,
+            )
+        else:
+            speed = (T[:3, :3].T @ drive.velocities[k])[0] + rng.normal() * SPEED_SIGMA
+            yield TwistObservation(
+                stamp_ns,
+                'wheels',
+                np.array([speed, 0, 0, 0, 0, 0]),
+                SPEED_SIGMA**2 * np.eye(6),
+                axes=(True, *(False,) * 5),
+            )
+        if k % 100 == 50:
+            position = T[:3, :3] @ ANTENNA + T[:3, 3] + rng.normal(size=3) * GNSS_SIGMAS
+            yield PositionObservation(stamp_ns, 'gnss', position, np.diag(GNSS_SIGMAS**2), ANTENNA)
+
+
+def begun(drive: ReferenceDrive, rng: np.random.Generator, settings: EkfSettings) -> VehicleEkf:
+    """Return a filter that starts off the truth by as much as it is told."""
+    ekf = VehicleEkf(settings)
+    s = settings.start
+    sigmas = np.array([s.position] * 3 + [s.rotation] * 3)
+    T = drive.T_map_body[0] @ se3.exp(-rng.normal(size=6) * sigmas)
+    velocity = drive.velocities[0] + rng.normal(size=3) * s.velocity
+    ekf.start(int(drive.stamps_ns[0]), T, np.diag(sigmas**2), velocity)
+    return ekf
+
+
+def settings(*, gate: float = 1.0) -> EkfSettings:
+    """Return the filter's settings: those the drive is simulated with."""
+    return EkfSettings(motion=MOTION, start=START, gate=GateConfig(probability=gate))
+
+
+def imu_of(drive: ReferenceDrive, rng: np.random.Generator) -> ImuRecord:
+    """Return the samples of a run."""
+    return sense(
+        drive,
+        rng,
+        noise=(MOTION.gyroscope_noise, MOTION.accelerometer_noise),
+        walk=(MOTION.gyroscope_walk, MOTION.accelerometer_walk),
+        bias=(START.gyroscope_bias, START.accelerometer_bias),
+    )
+
+
+def run_once(drive: ReferenceDrive, seed: int, camera: CameraErrors | None = None) -> RunRecord:
+    """Filter one run; NEES is taken after each observation of the camera."""
+    rng = np.random.default_rng(seed)
+    imu = imu_of(drive, rng)
+    ekf = begun(drive, rng, settings())
+    record = RunRecord()
+    ekf.on_verdict = lambda verdict: record.verdicts[verdict.source].append(verdict)
+    coming = observations(drive, rng, camera)
+    following: Observation | None = next(coming)
+    for k, stamp_ns in enumerate(drive.stamps_ns.tolist()):
+        ekf.add_imu(stamp_ns, imu.turn_rates[k], imu.forces[k])
+        while following is not None and following.stamp_ns <= stamp_ns:
+            ekf.observe(following)
+            if following.source == 'camera':
+                estimate = ekf.estimate()
+                assert estimate is not None
+                record.nees.append(
+                    nees(estimate.T_map_body, estimate.covariance, drive.T_map_body[k])
+                )
+            following = next(coming, None)
+    return record
+
+
+def consistency(
+    runs: int = 50, seconds: float = 60.0, camera: CameraErrors | None = None
+) -> dict[str, Any]:
+    """Return ANEES, NIS and autocorrelation over runs on the same drive with other noise."""
+    drive = reference_drive(seconds)
+    records = [run_once(drive, seed, camera) for seed in tqdm(range(runs), unit='run')]
+    values = np.array([record.nees for record in records])
+    epochs = np.arange(values.shape[1]) * 0.1 >= _SETTLING_S
+    result = anees(values[:, epochs])
+    figures: dict[str, Any] = {
+        'runs': runs,
+        'seconds': seconds,
+        'anees_band_low': result.low,
+        'anees_band_high': result.high,
+        'anees_inside_share': result.inside_share,
+        'anees_inside_share_from_start': anees(values).inside_share,
+        'anees_mean': result.mean,
+    }
+    for source in ('camera', 'wheels', 'gnss'):
+        verdicts = [record.verdicts[source] for record in records]
+        degrees = np.mean([v.dof for run in verdicts for v in run])
+        figures[f'nis_{source}'] = float(np.mean([v.nis for run in verdicts for v in run]))
+        figures[f'nis_{source}_expected'] = float(degrees)
+        whitened = [np.array([v.whitened for v in run]) for run in verdicts]
+        figures[f'autocorrelation_{source}'] = autocorrelation(whitened)
+    return figures
+
+
+def speed(samples: int = 20_000) -> dict[str, Any]:
+    """Return how many inertial samples a second the filter takes, its history included.
+
+    By processor time of one thread, for the wall clock also counts what else the machine does; and
+    the best of five, by the wall clock, beside it.
+    """
+    drive = reference_drive(samples / 5 / 100)
+    by_processor, by_wall = [], []
+    for _ in range(5):
+        ekf = VehicleEkf(settings())
+        ekf.start(-1, drive.T_map_body[0])
+        processor, wall = time.process_time(), time.perf_counter()
+        for k, stamp_ns in enumerate(drive.stamps_ns.tolist()):
+            ekf.add_imu(stamp_ns, drive.turn_rates[k], drive.forces[k])
+        by_processor.append(len(drive.stamps_ns) / (time.process_time() - processor))
+        by_wall.append(len(drive.stamps_ns) / (time.perf_counter() - wall))
+    return {'imu_hz': float(np.median(by_processor)), 'imu_hz_wall_best': float(max(by_wall))}
