@@ -1,7 +1,7 @@
 """Write the nodes' parameter files from the settings that the nodes declare.
 
-    python tools/parameter_files.py          writes lcd_loop_closure/config/*.yaml
-                                             and the tables of lcd_loop_closure/README.md
+    python tools/parameter_files.py          writes config/*.yaml of the packages
+                                             and the tables of their README.md
     python tools/parameter_files.py --check  says which of them are out of date
 
 A setting's default, meaning and unit stand in the code alone; this keeps the files true to it.
@@ -27,43 +27,64 @@ from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNodeConfig
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNodeConfig
 from lcd_loop_closure.online_map import OnlineMapConfig
 from lcd_loop_closure.place_gate import PlaceGateConfig
+from lcd_loop_closure.reduction import ReductionConfig
 from lcd_loop_closure.robust_solver import RobustSolverConfig
 from lcd_loop_closure.session_anchor import AnchorConfig
+from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNodeConfig
+from uncertain_place_recognition.place_recognizer import PlaceRecognizerConfig
+from uncertain_place_recognition.relocalizer import RelocalizerConfig
 
-PACKAGE = Path(__file__).resolve().parents[1] / 'lcd_loop_closure'
-CONFIG, README = PACKAGE / 'config', PACKAGE / 'README.md'
+ROOT = Path(__file__).resolve().parents[1]
 _COMMENT_AT = 44
+_Parts = tuple[tuple[type, ...], dict[str, type]]
 
 
 def parameter_files() -> dict[Path, str]:
-    """Return every parameter file's path and what it must hold, and the README's."""
-    files = {CONFIG / f'{node}.yaml': _file(node, *parts) for node, parts in _nodes().items()}
-    return {**files, README: _readme(README.read_text())}
+    """Return every parameter file's path and what it must hold, and the READMEs'."""
+    files = {}
+    for package, nodes in _nodes().items():
+        config, readme = ROOT / package / 'config', ROOT / package / 'README.md'
+        files |= {config / f'{node}.yaml': _file(node, *parts) for node, parts in nodes.items()}
+        files[readme] = _readme(readme, nodes)
+    return files
 
 
-def _nodes() -> dict[str, tuple[tuple[type, ...], dict[str, type]]]:
-    """Return each node's settings: those without a prefix, and the groups."""
+def _nodes() -> dict[str, dict[str, _Parts]]:
+    """Return each package's nodes and their settings: those without a prefix, and the groups."""
     return {
-        'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),
-        'loop_closure': (
-            (LoopClosureNodeConfig,),
-            {
-                'keyframes': KeyframeConfig,
-                'gate': PlaceGateConfig,
-                **_groups(LoopDetectorSettings()),
-            },
-        ),
-        'pose_graph': (
-            (PoseGraphNodeConfig,),
-            {
-                **_groups(GraphSettings()),
-                'imu': ImuConfig,
-                'solver': RobustSolverConfig,
-                'online_map': OnlineMapConfig,
-                'anchor': AnchorConfig,
-                'map_cloud': MapCloudConfig,
-            },
-        ),
+        'lcd_loop_closure': {
+            'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),
+            'loop_closure': (
+                (LoopClosureNodeConfig,),
+                {
+                    'keyframes': KeyframeConfig,
+                    'gate': PlaceGateConfig,
+                    **_groups(LoopDetectorSettings()),
+                },
+            ),
+            'pose_graph': (
+                (PoseGraphNodeConfig,),
+                {
+                    **_groups(GraphSettings()),
+                    'imu': ImuConfig,
+                    'solver': RobustSolverConfig,
+                    'online_map': OnlineMapConfig,
+                    'anchor': AnchorConfig,
+                    'map_cloud': MapCloudConfig,
+                },
+            ),
+        },
+        'uncertain_place_recognition': {
+            'place_recognition': (
+                (PlaceRecognitionNodeConfig,),
+                {
+                    'places': KeyframeConfig,
+                    'recognizer': PlaceRecognizerConfig,
+                    'reduction': ReductionConfig,
+                    'relocalizer': RelocalizerConfig,
+                },
+            ),
+        },
     }
 
 
@@ -71,13 +92,14 @@ def _groups(settings: Any) -> dict[str, type]:
     return {f.name: type(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
 
 
-def _readme(text: str) -> str:
+def _readme(readme: Path, nodes: dict[str, _Parts]) -> str:
     """Return the README with the parameters between its markers."""
-    for node, (tops, groups) in _nodes().items():
+    text = readme.read_text()
+    for node, (tops, groups) in nodes.items():
         begin = f'<!-- parameters:{node} -->'
         before, found, rest = text.partition(begin)
         if not found or '<!-- end -->' not in rest:
-            raise SystemExit(f'error: {README.name} has no {begin} ... <!-- end -->')
+            raise SystemExit(f'error: {readme} has no {begin} ... <!-- end -->')
         table = [
             '',
             '',

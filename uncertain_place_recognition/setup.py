@@ -38,7 +38,9 @@ setup(
         (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
     ],
     entry_points={
-        'console_scripts': [],
+        'console_scripts': [
+            'place_recognition = uncertain_place_recognition.nodes.place_recognition_node:main',
+        ],
     },
     zip_safe=False,
 )

@@ -12,10 +12,10 @@ pytest.importorskip('rclpy')
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
+from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
-CONFIG = ROOT / 'lcd_loop_closure' / 'config'
 
 
 def test_they_are_up_to_date() -> None:
@@ -26,15 +26,24 @@ def test_they_are_up_to_date() -> None:
 
 
 @pytest.mark.parametrize(
-    ('name', 'cls'),
+    ('package', 'name', 'cls'),
     [
-        ('lidar_odometry', LidarOdometryNode),
-        ('loop_closure', LoopClosureNode),
-        ('pose_graph', PoseGraphNode),
+        ('lcd_loop_closure', 'lidar_odometry', LidarOdometryNode),
+        ('lcd_loop_closure', 'loop_closure', LoopClosureNode),
+        ('lcd_loop_closure', 'pose_graph', PoseGraphNode),
+        ('uncertain_place_recognition', 'place_recognition', PlaceRecognitionNode),
     ],
 )
-def test_ros_reads_every_default_from_them(make: Callable[..., Any], name: str, cls: Any) -> None:
-    file = CONFIG / f'{name}.yaml'
+def test_ros_reads_every_default_from_them(
+    make: Callable[..., Any],
+    package: str,
+    name: str,
+    cls: Any,
+    small_weights: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('uncertain_place_recognition.opened.SHIPPED', small_weights)
+    file = ROOT / package / 'config' / f'{name}.yaml'
     plain = make(cls)
     # What stands in the file is read: not one parameter is left to its default in the code.
     given = make(cls, namespace='deep/down', cli_args=['--ros-args', '--params-file', str(file)])

@@ -27,17 +27,12 @@ class KeyframePoses:
         self._search = RadiusSearch()
         self._graph: GraphPositions | None = None
         self._seen: dict[int, se3.Array] = {}
-
-    @property
-    def located(self) -> bool:
-        """Tell whether the graph knows where this session lies in the loaded map."""
-        if not self._loaded:
-            return True
-        return self._graph is not None and any(int(i) in self._session for i in self._graph.ids)
+        self.located = not self._loaded  # whether the graph knows where this session lies
 
     def add(self, id: int, stamp_ns: int, T_odom_base: se3.Array) -> None:
         """Take in a keyframe of this session."""
         self._session[id] = _keyframe(id, stamp_ns, T_odom_base)
+        self._note_located()
 
     def pose(self, id: int) -> se3.Array | None:
         """Return T_map_base of a keyframe; None when it is unknown or the session not located."""
@@ -52,6 +47,7 @@ class KeyframePoses:
     def corrected(self, graph: GraphPositions) -> dict[int, se3.Array]:
         """Take in the graph's positions; return T_map_base by id of the keyframes that moved."""
         self._graph = graph
+        self._note_located()
         moved = {}
         for id, xyz in zip(graph.ids.tolist(), graph.xyz, strict=True):
             if id not in self._session and id not in self._loaded:
@@ -63,6 +59,11 @@ class KeyframePoses:
                 if T_map_base is not None:
                     moved[id] = T_map_base
         return moved
+
+    def _note_located(self) -> None:
+        if not self.located and self._graph is not None:
+            session = np.fromiter(self._session, np.int64)
+            self.located = bool(np.isin(self._graph.ids, session).any())
 
 
 def _keyframe(id: int, stamp_ns: int, T_odom_base: se3.Array) -> Keyframe:

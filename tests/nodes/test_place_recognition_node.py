@@ -1,0 +1,391 @@
+"""Feed place_recognition by hand and read what it publishes."""
+
+import asyncio
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+import made_up_drive as drive
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from std_srvs.srv import Trigger
+
+from bags.nodes.lockstep import LockStep
+from lcd_common import se3
+from lcd_common.errors import ConfigError, MapError
+from lcd_common.nodes import messages
+from lcd_loop_closure.nodes.positions_message import positions_message
+from lcd_msgs.msg import PlaceMatchArray
+from lcd_msgs.srv import LoadMap, SaveMap
+from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
+from uncertain_place_recognition.place import Judgement
+from uncertain_place_recognition.relocalizer import Relocalized
+
+pytestmark = pytest.mark.ros
+SPACING = {'places__distance': 0.5, 'recognizer__delay': 0}
+
+
+class Fed:
+    """A node in lock-step, and what it published."""
+
+    def __init__(self, node: PlaceRecognitionNode, prefix: str = '/', transform: bool = True):
+        self.node, self.prefix = node, prefix
+        self.lockstep = LockStep([node])
+        self.answers: list[PlaceMatchArray] = []
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.markers: list[Any] = []
+        self.lockstep.listen(prefix + 'place_matches', lambda m: self.answers.append(m))
+        self.lockstep.listen(prefix + 'initialpose', lambda m: self.poses.append(m))
+        self.lockstep.listen(prefix + 'place_markers', lambda m: self.markers.append(m))
+        if transform:
+            self.lockstep.feed('/tf_static', drive.static_transform())
+
+    def step(self, step: int, seen: int | None = None, **options: Any) -> None:
+        """Feed the scan of a step (or what another step sees), then its odometry."""
+        scan = drive.scan(step if seen is None else seen, stamp_ns=drive.stamp(step), **options)
+        self.lockstep.feed(self.prefix + 'points', scan)
+        self.lockstep.feed(self.prefix + 'odom', drive.odom_message(step))
+
+    def counted(self, cause: str) -> int:
+        """Return a counter of the node."""
+        return self.node.diagnostics.counted(cause)
+
+    def service(self, name: str, request: Any, response: Any) -> Any:
+        """Call a service of the node."""
+        return getattr(self.node.services_offered, name)(request, response)
+
+    def save(self, path: Path) -> Any:
+        """Save the places."""
+        call = self.service('on_save_map', SaveMap.Request(path=str(path)), SaveMap.Response())
+        return asyncio.run(call)
+
+    def load(self, path: Path | str) -> Any:
+        """Load places."""
+        return self.service('on_load_map', LoadMap.Request(path=str(path)), LoadMap.Response())
+
+
+@pytest.fixture
+def fed(make: Callable[..., Any], small_weights: Path) -> Callable[..., Fed]:
+    """Make a fed node with small weights."""
+
+    def construct(transform: bool = True, **parameters: Any) -> Fed:
+        values = {'threaded': False, 'weights': str(small_weights), **SPACING, **parameters}
+        return Fed(make(PlaceRecognitionNode, **values), transform=transform)
+
+    return construct
+
+
+class Vouching:
+    """Judge that accepts what looks exactly the same."""
+
+    metric, matches = 'cosine', 5
+    withdrawn: str | None = None
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def judge(self, neighbours: Any, positions: Any, uncertainty: float, size: int) -> Judgement:
+        """Accept a similarity of one."""
+        same = bool(len(neighbours)) and bool(neighbours.similarity[0] > 0.9999)
+        accepted = same and self.withdrawn is None
+        return Judgement(0.01 if same else 0.6, accepted, self.withdrawn)
+
+
+def test_every_chosen_scan_is_answered_with_what_came_before(fed: Callable[..., Fed]) -> None:
+    made = fed()
+    for step in range(5):
+        made.step(step)
+    assert [len(m.matches) for m in made.answers] == [0, 1, 2, 3, 4]
+    assert [messages.stamp_ns(m.header.stamp) for m in made.answers] == [
+        drive.stamp(step) for step in range(5)
+    ]
+    assert made.answers[0].header.frame_id == 'lidar'
+    made.step(60, seen=2)
+    best = made.answers[-1].matches[0]
+    assert best.place_id == 2
+    assert best.similarity == pytest.approx(1.0, abs=1e-3)
+    assert best.uncertainty > 0
+    assert np.isnan(best.false_match_probability) and not best.accepted
+    pose, covariance = messages.from_pose_with_covariance(best.pose)
+    np.testing.assert_allclose(pose, drive.true_pose(2), atol=1e-6)
+    assert covariance is not None and 25.0 < covariance[0, 0] < 26.0  # 5 m, and odometry's own
+    status = made.node.diagnostics.status()
+    assert status.level == DiagnosticStatus.WARN
+    assert 'nothing is calibrated' in status.message
+    assert made.counted('places added') == 6
+
+
+def test_places_keep_their_distance_and_wait(fed: Callable[..., Fed]) -> None:
+    made = fed(places__distance=2.5, recognizer__delay=2)
+    for step in range(13):
+        made.step(step)
+    assert len(made.answers) == 5  # steps 0 3 6 9 12
+    assert [len(m.matches) for m in made.answers] == [0, 0, 0, 1, 2]
+
+
+def test_what_a_judge_says_is_published(fed: Callable[..., Fed]) -> None:
+    made = fed()
+    judge = made.node.recognizer._judge = Vouching()
+    made.step(0)
+    made.step(1, seen=0)
+    made.step(2)
+    accepted, rejected = (m.matches[0] for m in made.answers[1:])
+    assert accepted.accepted and accepted.false_match_probability == pytest.approx(0.01)
+    assert not rejected.accepted and rejected.false_match_probability == pytest.approx(0.6)
+    assert made.node.diagnostics.status().level == DiagnosticStatus.OK
+    judge.withdrawn = 'the map is too large'
+    made.step(3, seen=0)
+    withdrawn = made.answers[-1].matches[0]
+    assert not withdrawn.accepted and np.isnan(withdrawn.false_match_probability)
+    assert 'no guarantee: the map is too large' in made.node.diagnostics.status().message
+    assert made.counted('answers accepted') == made.counted('answers rejected') == 1
+    assert made.counted('answers without guarantee') == 1
+    colors = [m.markers[0].color for m in made.markers[1:]]
+    assert colors[0].g > 0.7 and colors[1].r > 0.8 and colors[2].r == colors[2].g
+
+
+def test_broken_input_is_counted_and_survived(fed: Callable[..., Fed]) -> None:
+    made = fed()
+    made.step(0)
+    broken = drive.odom_message(1)
+    broken.pose.pose.position.x = float('nan')
+    made.lockstep.feed('/odom', broken)
+    assert made.counted('rejected odom: broken') == 1
+    nameless = drive.scan(1)
+    nameless.fields[0].name = 'range'
+    made.lockstep.feed('/points', nameless)
+    made.lockstep.feed('/odom', drive.odom_message(1))
+    assert made.counted('rejected points: broken') == 1
+    empty = drive.scan(2)
+    empty.width, empty.row_step, empty.data = 0, 0, empty.data[:0]
+    made.lockstep.feed('/points', empty)
+    made.lockstep.feed('/odom', drive.odom_message(2))
+    assert made.counted('rejected points: no submap') == 1
+    partly = drive.scan(3)
+    values = np.frombuffer(bytes(partly.data), np.float32).copy().reshape(partly.width, -1)
+    values[::10, 0] = np.nan
+    partly.data = values.tobytes()
+    made.lockstep.feed('/points', partly)
+    made.lockstep.feed('/odom', drive.odom_message(3))
+    assert made.counted('points without coordinates') == 300
+    made.step(3)
+    assert made.counted('rejected points: duplicate stamp') == 1
+    assert len(made.answers) == 2
+    for step in range(4, 20):  # odometry is gone
+        made.lockstep.feed('/points', drive.scan(step, count=40))
+    assert made.counted('rejected points: odometry did not come') == 6
+
+
+def test_without_the_transform_nothing_is_guessed(fed: Callable[..., Fed]) -> None:
+    made = fed(transform=False)
+    made.step(0)
+    assert made.answers == []
+    assert made.counted('rejected points: no transform') == 1
+    assert made.node.diagnostics.status().level == DiagnosticStatus.ERROR
+    made.lockstep.feed('/tf_static', drive.static_transform())
+    made.step(1)
+    assert len(made.answers) == 1
+
+
+def test_a_looped_bag_starts_again(fed: Callable[..., Fed]) -> None:
+    made = fed()
+    for _ in range(2):
+        for step in range(40):
+            made.step(step, count=1500)
+    assert [len(m.matches) for m in made.answers] == [*range(5), *[5] * 35] * 2
+    assert made.counted('clock jumps in odom') == 1
+
+
+def test_maps_are_saved_and_loaded_by_services(fed: Callable[..., Fed], tmp_path: Path) -> None:
+    made = fed()
+    assert 'no place yet' in made.save(tmp_path / 'map').message
+    for step in range(4):
+        made.step(step)
+    answer = made.save(tmp_path / 'map')
+    assert answer.success and answer.message.startswith('4 places saved in')
+    (tmp_path / 'mine.txt').write_text('precious')
+    answer = made.save(tmp_path)
+    assert not answer.success and 'no part of a map' in answer.message
+    for path in ('', tmp_path):
+        assert not made.load(path).success
+    assert len(made.node.recognizer) == 4  # a map that cannot be loaded costs nothing
+
+    later = fed(map=str(tmp_path / 'map'))
+    later.step(20, seen=3)
+    assert later.answers[0].matches[0].place_id == 3
+    later.step(21)
+    assert later.counted('places not added: not located') == 2
+    assert len(later.node.recognizer) == 4
+    assert later.load(tmp_path / 'map').message.startswith('4 places loaded')
+    with pytest.raises(MapError, match='expected the folder of saved places'):
+        fed(map=str(tmp_path))
+
+
+def test_a_place_is_added_by_hand(fed: Callable[..., Fed]) -> None:
+    made = fed(grow=False, places__distance=50.0)
+    made.step(0)
+    made.step(1)
+    assert len(made.node.recognizer) == 0
+    answer = made.service('on_add_place', Trigger.Request(), Trigger.Response())
+    assert answer.success
+    made.step(2)
+    made.step(3)
+    (place,) = made.node.recognizer.places()
+    assert place.stamp_ns == drive.stamp(2)
+    assert made.service('on_reset', Trigger.Request(), Trigger.Response()).success
+    assert len(made.node.recognizer) == 0
+
+
+def test_keyframes_give_places_their_numbers_and_the_graph_their_poses(
+    fed: Callable[..., Fed],
+) -> None:
+    made = fed(follow='keyframes')
+    for step in range(6):
+        made.lockstep.feed('/points', drive.scan(step))
+        made.lockstep.feed('/odom', drive.odom_message(step))
+        if step != 3:  # keyframes alone become places
+            made.lockstep.feed('/keyframe', drive.keyframe(step, first_id=10))
+    assert [p.id for p in made.node.recognizer.places()] == [10, 11, 12, 14, 15]
+    assert len(made.answers) == 5
+    moved = np.array([se3.rotation_z(0.3) @ drive.true_pose(s) for s in range(6)])
+    moved[:, :3, 3] += [5.0, -2.0, 0.0]
+    made.lockstep.feed('/graph/keyframes', positions_message(np.arange(10, 16), moved, 1, 'map'))
+    for step in (0, 1, 2, 4, 5):
+        np.testing.assert_allclose(
+            made.node.recognizer.place(10 + step).T_map_base, moved[step], atol=1e-4
+        )
+    made.lockstep.feed('/graph/keyframes', drive.scan(0))
+    assert made.counted('rejected graph/keyframes: broken') == 1
+    # loop_closure starts again
+    made.lockstep.feed('/points', drive.scan(7))
+    made.lockstep.feed('/keyframe', _numbered(drive.keyframe(7), 0))
+    assert [p.id for p in made.node.recognizer.places()] == [0]
+
+
+def _numbered(message: Any, id: int) -> Any:
+    message.id = id
+    return message
+
+
+def test_a_keyframe_whose_cloud_never_came_is_counted(fed: Callable[..., Fed]) -> None:
+    made = fed(follow='keyframes')
+    for step in range(25):
+        made.lockstep.feed('/keyframe', drive.keyframe(step))
+    assert made.counted('rejected keyframe: its cloud did not come') == 5
+    made.lockstep.feed('/points', drive.scan(24))  # late, but it comes
+    assert len(made.answers) == 1
+
+
+def test_relocalization_publishes_one_initial_pose(
+    fed: Callable[..., Fed], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = fed()
+    for step in range(3):
+        made.step(step)
+    made.save(tmp_path / 'map')
+    later = fed(map=str(tmp_path / 'map'), relocalize=True)
+    T_map_odom = se3.from_rotation_translation(se3.so3_exp([0, 0, 1.0]), [3.0, 4.0, 0.0])
+    offered: list[int] = []
+
+    def offer(self: Any, answer: Any, cloud: Any, T_odom_base: Any) -> Relocalized | None:
+        offered.append(len(answer.matches))
+        if len(offered) < 3:
+            return None
+        return Relocalized(T_map_odom, T_map_odom @ T_odom_base, 0.01 * np.eye(6), 2)
+
+    monkeypatch.setattr('uncertain_place_recognition.relocalizer.Relocalizer.offer', offer)
+    for step in range(20, 22):
+        later.step(step)
+    assert 'looking for the vehicle' in later.node.diagnostics.status().message
+    for step in range(22, 26):
+        later.step(step)
+    (pose,) = later.poses
+    assert len(offered) == 3
+    assert pose.header.frame_id == 'map'
+    assert messages.stamp_ns(pose.header.stamp) == drive.stamp(22)
+    T_map_base, covariance = messages.from_pose_with_covariance(pose.pose)
+    np.testing.assert_allclose(T_map_base, T_map_odom @ drive.odometry_pose(22), atol=1e-6)
+    np.testing.assert_allclose(covariance, 0.01 * np.eye(6), atol=1e-9)
+    assert later.counted('places added') == 4  # from then on the map grows
+    np.testing.assert_allclose(
+        later.node.recognizer.places()[-1].T_map_base,
+        T_map_odom @ drive.odometry_pose(25),
+        atol=1e-6,
+    )
+    assert later.service('on_relocalize', Trigger.Request(), Trigger.Response()).success
+    later.step(26)
+    assert len(later.poses) == 2
+
+
+def test_a_slow_machine_drops_the_oldest_scan(
+    make: Callable[..., Any],
+    small_weights: Path,
+    spin_until: Callable[..., bool],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = make(PlaceRecognitionNode, weights=str(small_weights), waiting_scans=2, **SPACING)
+    free, asked = threading.Event(), []
+    embed = node.recognizer.embed
+
+    def slow(cloud: Any) -> Any:
+        asked.append(len(cloud))
+        free.wait(20.0)
+        return embed(cloud)
+
+    monkeypatch.setattr(node.recognizer, 'embed', slow)
+    answers: list[PlaceMatchArray] = []
+    node.create_subscription(PlaceMatchArray, 'place_matches', answers.append, 10)
+    node._transforms.on_tf_static(drive.static_transform())
+    for step in range(6):
+        node.on_points(drive.scan(step))
+        node.on_odom(drive.odom_message(step))
+        assert spin_until([node], lambda: len(asked) == 1)
+    assert node.diagnostics.counted('dropped scans: machine too slow') == 3
+    free.set()
+    assert spin_until([node], lambda: len(answers) == 3)
+    assert [messages.stamp_ns(m.header.stamp) for m in answers] == [
+        drive.stamp(step) for step in (0, 4, 5)
+    ]
+
+
+def test_namespaces_and_remaps(make: Callable[..., Any], small_weights: Path) -> None:
+    remap = ['--ros-args', '-r', 'points:=/velodyne_points']
+    options = {'threaded': False, 'weights': str(small_weights), 'follow': 'keyframes'}
+    node = make(PlaceRecognitionNode, namespace='car', cli_args=remap, **options)
+    names = {s.topic_name for s in node.subscriptions}
+    assert {'/velodyne_points', '/car/odom', '/car/keyframe', '/car/graph/keyframes'} <= names
+    published = {p.topic_name for p in node.publishers}
+    assert {'/car/place_matches', '/car/initialpose', '/car/place_markers'} <= published
+    services = {s.srv_name for s in node.services}
+    wanted = {'add_place', 'save_map', 'load_map', 'relocalize', 'reset'}
+    assert wanted <= {name.rsplit('/', 1)[-1] for name in services}
+
+
+def test_wrong_parameters_are_named(
+    make: Callable[..., Any], small_weights: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match='follow must be one of odom, keyframes'):
+        make(PlaceRecognitionNode, follow='gps', weights=str(small_weights))
+    with pytest.raises(ConfigError, match='nowhere does not exist: train an ensemble'):
+        make(PlaceRecognitionNode, weights=str(tmp_path / 'nowhere'))
+    with pytest.raises(MapError, match='no readable calibration'):
+        make(PlaceRecognitionNode, weights=str(small_weights), calibration=str(tmp_path / 'no'))
+
+
+def test_help_names_topics_and_services() -> None:
+    code = (
+        'from uncertain_place_recognition.nodes.place_recognition_node import main;'
+        'raise SystemExit(main())'
+    )
+    run = subprocess.run(
+        [sys.executable, '-c', code, '--help'], capture_output=True, text=True, check=True
+    )
+    for word in ('Subscribes', 'Publishes', 'Services', 'place_matches', '~/load_map', 'ros2 run'):
+        assert word in run.stdout
