@@ -13,7 +13,7 @@ class AmbiguityConfig:
 
     matches: int = setting(10, 'matches that are looked at', low=2)
     sharpness: float = setting(
-        20.0, 'a match whose distance is 1/sharpness above the best counts 1/e', low=0.0
+        20.0, 'a match whose distance is 1/sharpness above the best counts 1/e', low=0.01
     )
     cap: float = setting(500.0, 'deviation from which a match counts no more', unit='m', low=1.0)
     same_place: float = setting(25.0, 'matches nearer to the best are its place', unit='m', low=0.0)

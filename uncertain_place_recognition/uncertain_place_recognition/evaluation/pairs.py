@@ -69,25 +69,41 @@ class JudgedPair:
 
     def hit(self, n: int) -> NDArray[np.bool_]:
         """Return [Q] whether one of the n best matches is right."""
-        return self.right[:, :n].any(axis=1)
+        found: NDArray[np.bool_] = np.asarray(self.right[:, :n].any(axis=1))
+        return found
 
     @property
     def wrong(self) -> NDArray[np.bool_]:
         """Whether the best match [Q] is of another place."""
-        out: NDArray[np.bool_] = np.asarray(~self.right[:, 0])
-        return out
+        return ~self.right[:, 0]
 
 
 def judge_pairs(
-    runs: Sequence[EmbeddedRun], method: str, settings: PairConfig | None = None
+    runs: Sequence[EmbeddedRun],
+    method: str,
+    settings: PairConfig | None = None,
+    no_match_share: float = 0.0,
+    seed: int = 0,
 ) -> list[JudgedPair]:
     """Judge a method of METHODS on all ordered pairs of runs of one world.
+
+    Args:
+        runs: all.
+        method: of METHODS.
+        settings: radius and metric.
+        no_match_share: of queries, drawn, from whose database their place is taken away.
+        seed: of the draw; the same queries for every method.
 
     Raises:
         DataError: a run lacks the embeddings, or no two runs are of one world.
     """
     s = settings or PairConfig()
-    return [judge_pair(runs, pair, method, s) for pair in ordered_pairs(runs)]
+    judged = []
+    for m, n in ordered_pairs(runs):
+        drawn = np.random.default_rng([seed, m, n]).random(len(runs[n]))
+        masked = drawn < no_match_share if no_match_share > 0.0 else None
+        judged.append(judge_pair(runs, (m, n), method, s, masked))
+    return judged
 
 
 def judge_pair(
