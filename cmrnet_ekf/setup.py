@@ -34,6 +34,10 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
     ],
-    entry_points={'console_scripts': []},
+    entry_points={
+        'console_scripts': [
+            'ekf = cmrnet_ekf.nodes.ekf_node:main',
+        ],
+    },
     zip_safe=False,
 )

@@ -15,6 +15,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cmrnet_ekf.ekf.ekf_settings import EkfSettings
+from cmrnet_ekf.ekf.gnss_start import GnssStartConfig
+from cmrnet_ekf.nodes.ekf_health import EkfHealthConfig
+from cmrnet_ekf.nodes.ekf_inputs import FixInputConfig, OdometryInputConfig, PoseInputConfig
+from cmrnet_ekf.nodes.ekf_node import EkfNodeConfig
+from cmrnet_ekf.nodes.ekf_sources import EkfInputsConfig
+from cmrnet_ekf.nodes.gnss_datum import GnssDatumConfig
 from lcd_common.settings import describe
 from lcd_loop_closure.graph_settings import GraphSettings
 from lcd_loop_closure.imu_preintegration import ImuConfig
@@ -52,6 +59,20 @@ def parameter_files() -> dict[Path, str]:
 def _nodes() -> dict[str, dict[str, _Parts]]:
     """Return each package's nodes and their settings: those without a prefix, and the groups."""
     return {
+        'cmrnet_ekf': {
+            'ekf': (
+                (EkfNodeConfig, EkfInputsConfig),
+                {
+                    **_groups(EkfSettings()),
+                    'camera': PoseInputConfig,
+                    'odom': OdometryInputConfig,
+                    'gps': FixInputConfig,
+                    'datum': GnssDatumConfig,
+                    'gnss_start': GnssStartConfig,
+                    'health': EkfHealthConfig,
+                },
+            ),
+        },
         'lcd_loop_closure': {
             'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),
             'loop_closure': (

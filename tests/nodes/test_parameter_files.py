@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 pytest.importorskip('rclpy')
+from cmrnet_ekf.nodes.ekf_node import EkfNode
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
@@ -28,6 +29,7 @@ def test_they_are_up_to_date() -> None:
 @pytest.mark.parametrize(
     ('package', 'name', 'cls'),
     [
+        ('cmrnet_ekf', 'ekf', EkfNode),
         ('lcd_loop_closure', 'lidar_odometry', LidarOdometryNode),
         ('lcd_loop_closure', 'loop_closure', LoopClosureNode),
         ('lcd_loop_closure', 'pose_graph', PoseGraphNode),
