@@ -40,6 +40,8 @@ setup(
     entry_points={
         'console_scripts': [
             'place_recognition = uncertain_place_recognition.nodes.place_recognition_node:main',
+            'make_submap_runs = uncertain_place_recognition.datasets.make_runs:main',
+            'train_place_recognition = uncertain_place_recognition.training.train:main',
         ],
     },
     zip_safe=False,

@@ -64,5 +64,5 @@ def test_tables_without_the_columns_are_refused(run_folder):
         read_benchmark_run(run_folder, 'pointcloud_20m')
     table.unlink()
     (run_folder / 'pointcloud_locations_other.csv').write_text('')
-    with pytest.raises(DataError, match='expected pointcloud_locations_20m.csv'):
+    with pytest.raises(DataError, match=r'expected pointcloud_locations_20m\.csv'):
         read_benchmark_run(run_folder, 'pointcloud_20m')

@@ -18,8 +18,8 @@ from uncertain_place_recognition.runs import SubmapRun
 
 POINTS = 4096
 _BYTES = POINTS * 3 * 8
-# Normalised submaps lie within 1, 0.5 from their middle in the mean. Pairs of float32 numbers read as
-# float64 are near zero, metres are far outside.
+# Normalised submaps lie within 1, 0.5 from their middle in the mean. Pairs of float32 numbers read
+# as float64 are near zero, metres are far outside.
 _LARGEST, _LEAST_SPREAD = 1.5, 0.05
 
 
