@@ -37,6 +37,7 @@ setup(
     entry_points={
         'console_scripts': [
             'ekf = cmrnet_ekf.nodes.ekf_node:main',
+            'build_lidar_map = cmrnet_ekf.mapping.build:main',
         ],
     },
     zip_safe=False,
