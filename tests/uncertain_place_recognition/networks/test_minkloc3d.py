@@ -1,8 +1,11 @@
 """MinkLoc3D: its size, and its numbers against dense convolution."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from small_runs import turned
 from torch.nn import functional
 
 from lcd_common.errors import ConfigError
@@ -94,6 +97,19 @@ def test_embeddings_do_not_depend_on_the_company_or_on_the_order_of_points():
         shuffled = network.embed(cloud[:, torch.randperm(300)])
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(together, shuffled, rtol=1e-4, atol=1e-6)
+
+
+def test_a_turn_by_whole_columns_moves_polar_voxels_round():
+    network = MinkLoc3d(replace(COMPACT, coordinates='polar', azimuths=64, voxel=0.05))
+    rng = np.random.default_rng(0)
+    azimuth = (rng.integers(0, 64, 200) + 0.5) / 64 * 2 * np.pi
+    radius, height = rng.uniform(0.1, 1, 200), rng.uniform(0, 0.2, 200)
+    points = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], 1)
+    both = np.stack([points, turned(points, 360.0 / 64 * 10)]).astype(np.float32)
+    (one, other) = (network.prepare(torch.from_numpy(both[k : k + 1]))[0] for k in (0, 1))
+    cells = [sorted(map(tuple, v.coordinates[:, 1:].tolist())) for v in (one, other)]
+    assert cells[1] == sorted((r, (a + 10) % 64, z) for r, a, z in cells[0])
+    assert all(0 <= a < 64 for _, a, _ in cells[0])
 
 
 def test_generalised_mean_against_its_formula():

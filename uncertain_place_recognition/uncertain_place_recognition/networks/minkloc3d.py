@@ -1,5 +1,6 @@
 """MinkLoc3D (Komorowski, WACV 2021) on the suite's sparse convolution."""
 
+import math
 from typing import Any
 
 import torch
@@ -17,7 +18,14 @@ _SMALLEST = 1e-6  # GeM's eps; as a clamp it acts as a ReLU
 class MinkLoc3dConfig:
     """Shape of the network; the defaults are the paper's (1,055,713 parameters)."""
 
+    coordinates: str = setting(
+        'cartesian',
+        'of the voxels: x y z, or distance, azimuth and height, which MinkLoc3Dv2 offers for '
+        'sweeps that see all around',
+        choices=('cartesian', 'polar'),
+    )
     voxel: float = setting(0.01, 'edge of a voxel, in units of a submap', low=0.001, high=0.5)
+    azimuths: int = setting(160, 'polar voxels of a full turn', low=8, high=4096)
     first_kernel: int = setting(5, 'of the first convolution', low=1)
     planes: tuple[int, ...] = setting((32, 64, 64), 'channels of the three stages')
     size: int = setting(256, 'D: numbers of the embedding', low=2)
@@ -63,9 +71,21 @@ class MinkLoc3d(PlaceNetwork):
         """Return voxels with feature 1, and the number of submaps; their kernel maps get shared."""
         clouds, number = points.shape[:2]
         xyz = points.reshape(-1, 3).float()
+        if self.settings.coordinates == 'polar':
+            xyz = self._polar(xyz)
         batch = torch.arange(clouds, device=points.device).repeat_interleave(number)
         voxel = (self.settings.voxel,) * 3
         return voxelize(xyz, torch.ones_like(xyz[:, :1]), voxel, batch), clouds
+
+    def _polar(self, xyz: Tensor) -> Tensor:
+        """Return distance, azimuth and height; azimuths so large that a voxel's edge divides them.
+
+        Its first voxel and its last are no neighbours: behind the car, two columns miss each other.
+        """
+        x, y, z = xyz.unbind(1)
+        turn = self.settings.azimuths * self.settings.voxel
+        azimuth = (torch.atan2(y, x) / (2.0 * math.pi) + 0.5) * turn
+        return torch.stack([torch.hypot(x, y), azimuth, z], 1)
 
     def pool(self, seen: tuple[SparseTensor, int]) -> Tensor:
         """Return pooled features [B x D]."""
