@@ -41,6 +41,8 @@ setup(
         'console_scripts': [
             'place_recognition = uncertain_place_recognition.nodes.place_recognition_node:main',
             'make_submap_runs = uncertain_place_recognition.datasets.make_runs:main',
+            'calibrate_place_recognition = uncertain_place_recognition.calibrate:main',
+            'evaluate_place_recognition = uncertain_place_recognition.evaluate:main',
             'train_place_recognition = uncertain_place_recognition.training.train:main',
         ],
     },

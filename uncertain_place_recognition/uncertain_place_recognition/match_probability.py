@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from lcd_common.errors import DataError, MapError
 
 FEATURES = ('distance', 'uncertainty', 'ambiguity', 'ratio')
 _KNOTS = 33
-_RIDGE = 1e-3
+_SLOPE = 3.0  # spread of slopes that is expected, of a normal prior
+# Of normal scores: between neighbours the logit rises in a straight line.
+_BENDS = np.array([-np.inf, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, np.inf])
 Array = NDArray[np.float64]
 
 
@@ -46,14 +49,14 @@ class MatchModel:
     """A logistic model that never believes a match more because something speaks against it.
 
     Every feature becomes the normal score of its rank among the calibration's queries, so that
-    units and heavy tails do not matter; the logit of a wrong match is a sum of rising functions of
-    these. Beyond the range of the calibration the scores go on as a logarithm.
+    units and heavy tails do not matter; the logit of a wrong match is a sum of functions of these
+    that rise in straight pieces. Beyond the range of the calibration scores go on as a logarithm.
 
     Attributes:
         names: of the features.
         knots: [F x K] quantiles of each feature, rising.
         scores: [F x K] normal scores of the knots.
-        weights: [F x 2] of a normal score, and of its part above zero; at least 0.
+        weights: [F x 8] slope of each piece, at least 0.
         intercept: of the logit.
     """
 
@@ -91,21 +94,21 @@ class MatchModel:
         curves = [_curve(column) for column in x.T]
         knots, scores = (np.stack(part) for part in zip(*curves, strict=True))
         basis = _basis(x, knots, scores)
-        sign = np.where(y, 1.0, -1.0)
+        sign, ridge = np.where(y, 1.0, -1.0), 0.5 / (_SLOPE**2 * len(y))
 
         def loss(parameters: Array) -> tuple[float, Array]:
             weights, intercept = parameters[1:], parameters[0]
             margin = sign * (basis @ weights + intercept)
             slope = -sign * expit(-margin) / len(y)
-            value = -log_expit(margin).mean() + _RIDGE * weights @ weights
-            gradient = basis.T @ slope + 2.0 * _RIDGE * weights
+            value = -log_expit(margin).mean() + ridge * weights @ weights
+            gradient = basis.T @ slope + 2.0 * ridge * weights
             return float(value), np.concatenate([[slope.sum()], gradient])
 
         share = y.mean()
         start = np.concatenate([[np.log(share / (1.0 - share))], np.full(basis.shape[1], 0.1)])
         bounds = [(None, None)] + [(0.0, None)] * basis.shape[1]
         found = minimize(loss, start, jac=True, bounds=bounds, method='L-BFGS-B').x
-        weights = found[1:].reshape(len(names), 2)
+        weights = found[1:].reshape(len(names), -1)
         return MatchModel(tuple(names), knots, scores, weights, float(found[0]))
 
     def false_match_probability(self, features: 'MatchFeatures | ArrayLike') -> Array:
@@ -150,11 +153,8 @@ class MatchModel:
             intercept = float(plain['intercept'])
         except (KeyError, TypeError, ValueError) as error:
             raise MapError(f'no model of match probabilities: {error!r}') from None
-        if (
-            knots.shape != scores.shape
-            or len(knots) != len(names)
-            or weights.shape != (len(names), 2)
-        ):
+        pieces = (len(names), len(_BENDS) - 1)
+        if knots.shape != scores.shape or len(knots) != len(names) or weights.shape != pieces:
             raise MapError('a model of match probabilities whose parts do not fit together')
         return MatchModel(names, knots, scores, weights, intercept)
 
@@ -184,7 +184,7 @@ def _curve(column: Array) -> tuple[Array, Array]:
 
 
 def _basis(x: Array, knots: Array, scores: Array) -> Array:
-    """Return [... x 2F]: the normal score of every feature, and its part above zero."""
+    """Return [... x 8F]: of every feature, how much of its normal score lies in each piece."""
     columns = []
     for number, (at, value) in enumerate(zip(knots, scores, strict=True)):
         one = x[..., number]
@@ -194,5 +194,8 @@ def _basis(x: Array, knots: Array, scores: Array) -> Array:
             # Outside, order is kept, but tails may be heavy: a logarithm.
             outside = (one - np.clip(one, at[0], at[-1])) / run
             score = score + np.sign(outside) * np.log1p(np.abs(outside))
-        columns += [score, np.maximum(score, 0.0)]
+        # Pieces begin at the bend that is nearer to zero, so that their sum is the score.
+        for low, high in pairwise(_BENDS):
+            origin = low if np.isfinite(low) and low >= 0.0 else high
+            columns.append(np.clip(score, low, high) - origin)
     return np.stack(columns, axis=-1)

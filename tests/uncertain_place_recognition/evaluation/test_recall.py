@@ -6,7 +6,7 @@ from made_runs import made_run
 
 from lcd_common.errors import DataError
 from uncertain_place_recognition.embedded_run import EmbeddedRun, is_embedded, ordered_pairs
-from uncertain_place_recognition.evaluation.bootstrap import interval_over_runs, mean_interval
+from uncertain_place_recognition.evaluation.bootstrap import drawn_pairs, mean_interval
 from uncertain_place_recognition.evaluation.interchange import interchange
 from uncertain_place_recognition.evaluation.pairs import (
     METHODS,
@@ -126,8 +126,18 @@ def test_the_interval_over_runs_is_wider_than_that_over_queries():
 
 
 def test_two_runs_say_nothing_about_runs():
-    assert interval_over_runs([(0, 1), (1, 0)], lambda chosen: 0.0) is None
+    assert list(drawn_pairs([(0, 1), (1, 0)])) == []
+    assert mean_interval([(0, 1), (1, 0)], np.ones(2)) is None
     assert mean_interval([(0, 1), (1, 2), (2, 0)], np.full(3, np.nan)) is None
+
+
+def test_a_pair_is_drawn_as_often_as_both_its_runs():
+    pairs = [(0, 1), (1, 2), (2, 0), (1, 0)]
+    counts = np.array([np.bincount(c, minlength=4) for c in drawn_pairs(pairs, 4000)])
+    assert np.array_equal(counts[:, 0], counts[:, 3])
+    # Of three draws, one each of two given runs and one of any: E[x y] = 3 * 2 / 9.
+    share = len(counts) / 4000
+    assert counts.mean(0) * share == pytest.approx(6 / 9, abs=0.05)
 
 
 def test_members_of_one_space_can_be_exchanged_and_others_cannot(runs):
