@@ -32,19 +32,3 @@ def make(ros: None) -> Iterator[Callable[..., Any]]:
     yield construct
     for node in nodes:
         node.destroy_node()
-
-
-@pytest.fixture(scope='session')
-def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with an ensemble that nobody trained: it still tells scans apart."""
-    import torch
-
-    from uncertain_place_recognition.ensemble import PACKED, EmbeddingEnsemble
-    from uncertain_place_recognition.networks.shapes import build, shape
-
-    torch.manual_seed(0)
-    small = shape('minkloc3d', 'compact', planes=(4, 4, 4), size=16)
-    folder = tmp_path_factory.mktemp('weights')
-    facts = {'submap': {'points': 512, 'fewest': 50}}
-    EmbeddingEnsemble([build(small) for _ in range(2)], facts).save(folder / PACKED)
-    return folder

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
-import torch
-
 from bags.nodes.lockstep import LockStep
 from bags.street import StreetConfig, StreetDrive
 from bags.street.lidar import LidarConfig
@@ -23,8 +21,6 @@ from lcd_loop_closure.map_store import load_map, save_map
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
-from uncertain_place_recognition.ensemble import PACKED, EmbeddingEnsemble
-from uncertain_place_recognition.networks.shapes import build, shape
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 from uncertain_place_recognition.place import Judgement
 
@@ -66,18 +62,10 @@ class Suite:
     said: dict[str, list[Any]]
 
 
-@pytest.fixture(scope='module')
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    small = shape('minkloc3d', 'compact', planes=(4, 8, 8), size=32)
-    folder = tmp_path_factory.mktemp('weights')
-    facts = {'submap': {'points': 1024, 'fewest': 50}}
-    EmbeddingEnsemble([build(small) for _ in range(2)], facts).save(folder / PACKED)
-    return folder
-
-
 @contextmanager
-def _suite(weights: Path, graph: str = '', places: str = '', **options: Any) -> Iterator[Suite]:
+def _suite(
+    small_weights: Path, graph: str = '', places: str = '', **options: Any
+) -> Iterator[Suite]:
     inside = {'threaded': False}
     search = {'detector__by_descriptor': not graph, 'detector__by_radius': False}
     nodes = (
@@ -95,7 +83,7 @@ def _suite(weights: Path, graph: str = '', places: str = '', **options: Any) -> 
         PoseGraphNode(parameter_overrides=overrides(map=graph, **inside)),
         PlaceRecognitionNode(
             parameter_overrides=overrides(
-                weights=str(weights),
+                weights=str(small_weights),
                 follow='keyframes',
                 map=places,
                 relocalize=bool(places),
@@ -125,10 +113,10 @@ class Driven:
 
 
 @pytest.fixture(scope='module')
-def driven(ros: None, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Driven:
+def driven(ros: None, small_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Driven:
     """Drive the block once, with a place recognition that believes itself."""
     folder = tmp_path_factory.mktemp('driven')
-    with _suite(weights) as suite:
+    with _suite(small_weights) as suite:
         suite.places.recognizer._judge = Doubting(True)
         suite.lockstep.run(_block(), progress=False)
         keyframes = [m.id for m in suite.said['keyframe']]
@@ -148,8 +136,10 @@ def driven(ros: None, weights: Path, tmp_path_factory: pytest.TempPathFactory) -
         )
 
 
-def test_what_place_recognition_rejects_is_not_registered(weights: Path, driven: Driven) -> None:
-    with _suite(weights) as suite:
+def test_what_place_recognition_rejects_is_not_registered(
+    small_weights: Path, driven: Driven
+) -> None:
+    with _suite(small_weights) as suite:
         suite.places.recognizer._judge = Doubting(False)
         suite.lockstep.run(_block(), progress=False)
         loops = suite.said['loop_constraint']
@@ -163,13 +153,13 @@ def test_what_place_recognition_rejects_is_not_registered(weights: Path, driven:
         assert counted('keyframes searched without an answer of place recognition') == 0
 
 
-def test_a_kidnapped_vehicle_is_found_in_the_saved_map(weights: Path, driven: Driven) -> None:
+def test_a_kidnapped_vehicle_is_found_in_the_saved_map(small_weights: Path, driven: Driven) -> None:
     """Start on another street with an odometry at zero; loop closure finds no loop by itself."""
     truth = _block().truth()
     assert truth is not None
-    with _suite(weights, str(driven.graph), str(driven.places)) as suite:
+    with _suite(small_weights, str(driven.graph), str(driven.places)) as suite:
         count = len(load_map(driven.graph).graph)
-        suite.lockstep.run(_block(), start_s=5.6, duration_s=3.8, progress=False)
+        suite.lockstep.run(_block(), start_s=5.6, duration_s=4.8, progress=False)
         assert suite.said['loop_constraint'] == []
         (pose,) = suite.said['initialpose']
         online = suite.pose_graph.map

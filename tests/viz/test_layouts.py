@@ -12,7 +12,8 @@ import yaml
 from bags.topics import CAMERA_INFO_TOPIC, TF_STATIC_TOPIC, TOPICS
 
 VIZ = Path(__file__).resolve().parents[2] / 'viz'
-PACKAGES = [VIZ.parent / name for name in ('lcd_common', 'lcd_loop_closure')]
+SHOWN = ('lcd_common', 'lcd_loop_closure', 'uncertain_place_recognition')
+PACKAGES = [VIZ.parent / name for name in SHOWN]
 RECORDED = {topic for topic, _ in TOPICS.values()} | {CAMERA_INFO_TOPIC, TF_STATIC_TOPIC}
 
 
@@ -88,15 +89,19 @@ def test_plotted_stages_are_timed_by_the_nodes(foxglove: dict[str, Any]) -> None
 
 @pytest.mark.ros
 def test_every_topic_is_published(
-    ros: None, foxglove: dict[str, Any], rviz: dict[str, Any]
+    ros: None, foxglove: dict[str, Any], rviz: dict[str, Any], small_weights: Path
 ) -> None:
     from rclpy.qos import DurabilityPolicy
 
+    from lcd_common.nodes.parameters import overrides
     from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
     from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
     from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
+    from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 
+    own = overrides(weights=str(small_weights))
     nodes = [LidarOdometryNode(), LoopClosureNode(), PoseGraphNode()]
+    nodes.append(PlaceRecognitionNode(parameter_overrides=own))
     try:
         durability = {p.topic_name: p.qos_profile.durability for n in nodes for p in n.publishers}
     finally:
