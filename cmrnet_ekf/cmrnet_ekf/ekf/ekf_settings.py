@@ -74,9 +74,15 @@ class GateConfig:
     )
     recover_after: int = setting(
         20,
-        'rejections in a row, of one input, which agree with each other: then the filter is wrong '
-        'and gives in; 0: never',
+        'rejections in a row of one input that agree with each other, after which the filter gives '
+        'in to them, unless another pose or fix is accepted meanwhile; 0: never',
         low=0,
+    )
+    recover_time: float = setting(
+        4.0,
+        'or three of them, when the last accepted one is so long ago (slow inputs)',
+        unit='s',
+        low=0.1,
     )
     recover_speed: float = setting(
         3.0, 'agreeing rejections may drift apart this fast', unit='m/s', low=0.0

@@ -30,6 +30,7 @@ class Memory:
     Attributes:
         stamp_ns: of the last observation, accepted or not.
         accepted_ns: of the last accepted one, None before any.
+        absolute: whether it says where the vehicle is in the map.
         rejected: rejections in a row that agree with each other.
         residual: of the last observation, when it was rejected.
         covariance: of the last observation itself, when it was rejected.
@@ -37,6 +38,7 @@ class Memory:
 
     stamp_ns: int
     accepted_ns: int | None = None
+    absolute: bool = False
     rejected: int = 0
     residual: se3.Array | None = None
     covariance: se3.Array | None = None
@@ -58,6 +60,7 @@ class MotionState:
         covariance: of the error, [15 + 6 clones] squared.
         turn_rate, force: the inertial sample that holds now [3], None when there is none.
         imu_ns: stamp of that sample.
+        doubtful: whether that sample is a guess (a frozen sensor): its noise is that of coasting.
         clones: past poses, in the order of their rows.
         memory: what to remember of each input, by name.
     """
@@ -72,6 +75,7 @@ class MotionState:
     turn_rate: se3.Array | None = None
     force: se3.Array | None = None
     imu_ns: int = 0
+    doubtful: bool = False
     clones: tuple[Clone, ...] = ()
     memory: tuple[tuple[str, Memory], ...] = ()
 

@@ -70,7 +70,10 @@ class Propagation:
             F[0:3, 12:15] = (0.5 * dt) * C
         P = self._moved(state.covariance)
         s = self.settings
-        self._add_noise(P, dt, s.accelerometer_noise**2, s.gyroscope_noise**2)
+        if state.doubtful:
+            self._add_noise(P, dt, s.coast_acceleration**2, s.coast_turn**2)
+        else:
+            self._add_noise(P, dt, s.accelerometer_noise**2, s.gyroscope_noise**2)
         v = state.v + dt * self._gravity
         return MotionState(
             stamp_ns,
@@ -83,6 +86,7 @@ class Propagation:
             state.turn_rate,
             state.force,
             state.imu_ns,
+            state.doubtful,
             state.clones,
             state.memory,
         )

@@ -16,7 +16,13 @@ from cmrnet_ekf.ekf.motion_state import (
     MotionState,
     corrected,
 )
-from cmrnet_ekf.ekf.observations import Innovation, Observation, TwistObservation
+from cmrnet_ekf.ekf.observations import (
+    Innovation,
+    Observation,
+    PoseObservation,
+    PositionObservation,
+    TwistObservation,
+)
 from lcd_common import se3
 
 # Giving in: how wrong velocity and heading may have become at most.
@@ -67,7 +73,7 @@ class Update:
         rejected, recovered = 0, False
         if not accepted:
             rejected = 1 + self._agreeing(innovation, seen, memory)
-            if self.gate.recover_after and rejected >= self.gate.recover_after:
+            if self._gives_in(state, seen, memory, rejected):
                 state = self._give_in(state, innovation, seen, memory)
                 PHt = state.covariance @ innovation.H.T
                 S = innovation.H @ PHt + innovation.covariance
@@ -75,6 +81,7 @@ class Update:
         verdict = Verdict(
             seen.source, seen.stamp_ns, accepted or recovered, recovered, nis, dof, whitened
         )
+        absolute = isinstance(seen, PoseObservation | PositionObservation)
         if not verdict.accepted:
             accepted_ns = None if memory is None else memory.accepted_ns
             return state.remembering(
@@ -82,13 +89,32 @@ class Update:
                 Memory(
                     seen.stamp_ns,
                     accepted_ns,
+                    absolute,
                     rejected,
                     innovation.residual,
                     innovation.covariance,
                 ),
             ), verdict
         state = _updated(state, innovation, PHt, S)
-        return state.remembering(seen.source, Memory(seen.stamp_ns, seen.stamp_ns)), verdict
+        return state.remembering(
+            seen.source, Memory(seen.stamp_ns, seen.stamp_ns, absolute)
+        ), verdict
+
+    def _gives_in(
+        self, state: MotionState, seen: Observation, memory: Memory | None, rejected: int
+    ) -> bool:
+        if not self.gate.recover_after:
+            return False
+        since_ns = seen.stamp_ns - round(self.gate.recover_time * 1e9)
+        for name, other in state.memory:
+            supported = other.absolute and other.accepted_ns is not None
+            if name != seen.source and supported and (other.accepted_ns or 0) > since_ns:
+                return False
+        accepted_ns = None if memory is None else memory.accepted_ns
+        long_ago = accepted_ns is None or accepted_ns <= since_ns
+        return rejected >= (
+            min(3, self.gate.recover_after) if long_ago else self.gate.recover_after
+        )
 
     def _agreeing(self, innovation: Innovation, seen: Observation, memory: Memory | None) -> int:
         """Return how many rejections in a row there were that this one agrees with.

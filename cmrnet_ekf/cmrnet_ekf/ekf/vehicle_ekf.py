@@ -69,7 +69,7 @@ class VehicleEkf:
         base = np.eye(4) if T_body_base is None else T_body_base
         self._constraints = Constraints(settings.constraint, base, self._update)
         self._history: History[Verdict | None] | None = None
-        self._early: deque[tuple[int, se3.Array, se3.Array]] = deque(maxlen=_WAITING_SAMPLES)
+        self._early: deque[tuple[int, se3.Array, se3.Array, bool]] = deque(maxlen=_WAITING_SAMPLES)
         self.on_verdict: Callable[[Verdict], None] | None = None
 
     @property
@@ -117,20 +117,26 @@ class VehicleEkf:
         )
         self._history = History(state, round(self.settings.history.length * 1e9))
         # The sample that held at the stamp, and those since.
-        for at_ns, turn_rate, force in sorted(self._early, key=lambda sample: sample[0]):
+        for at_ns, turn_rate, force, doubtful in sorted(self._early, key=lambda sample: sample[0]):
             if at_ns <= stamp_ns:
-                state = replace(state, turn_rate=turn_rate, force=force, imu_ns=at_ns)
+                state = replace(
+                    state, turn_rate=turn_rate, force=force, imu_ns=at_ns, doubtful=doubtful
+                )
                 self._history = History(state, round(self.settings.history.length * 1e9))
             elif at_ns != self._history.newest.imu_ns:
-                self._put_sample(at_ns, turn_rate, force)
+                self._put_sample(at_ns, turn_rate, force, doubtful)
 
     def reset(self) -> None:
         """Forget everything; nothing happens until the next start."""
         self._history = None
         self._early.clear()
 
-    def add_imu(self, stamp_ns: int, turn_rate: se3.Array, force: se3.Array) -> None:
+    def add_imu(
+        self, stamp_ns: int, turn_rate: se3.Array, force: se3.Array, *, doubtful: bool = False
+    ) -> None:
         """Take an inertial sample: turn rate and specific force (+g up at rest) in body axes [3].
+
+        A doubtful one is a guess: it moves the estimate, but with the noise of coasting.
 
         Raises:
             DataError: it is not finite, repeats a stamp or is older than the history.
@@ -139,9 +145,9 @@ class VehicleEkf:
             raise DataError('imu: expected finite rates and accelerations, got NaN or infinity')
         if self._early and stamp_ns == self._early[-1][0]:
             raise DataError(f'imu: a sample repeats the stamp {stamp_ns}')
-        self._early.append((stamp_ns, turn_rate, force))
+        self._early.append((stamp_ns, turn_rate, force, doubtful))
         if self._history is not None:
-            self._put_sample(stamp_ns, turn_rate, force)
+            self._put_sample(stamp_ns, turn_rate, force, doubtful)
 
     def observe(self, seen: Observation) -> Verdict:
         """Correct by an observation, however late within the history it comes.
@@ -194,7 +200,9 @@ class VehicleEkf:
         assert state is not None
         return _estimate(state, self.settings.motion.gyroscope_noise)
 
-    def _put_sample(self, stamp_ns: int, turn_rate: se3.Array, force: se3.Array) -> None:
+    def _put_sample(
+        self, stamp_ns: int, turn_rate: se3.Array, force: se3.Array, doubtful: bool
+    ) -> None:
         history = self._history
         assert history is not None
         if stamp_ns < history.begin_ns:
@@ -202,10 +210,15 @@ class VehicleEkf:
         key = (stamp_ns, _SAMPLE, '', 0)
         if history.knows(key):
             raise DataError(f'imu: a sample repeats the stamp {stamp_ns}')
-        history.put(Entry(key, partial(self._sample, stamp_ns, turn_rate, force)))
+        history.put(Entry(key, partial(self._sample, stamp_ns, turn_rate, force, doubtful)))
 
     def _sample(
-        self, stamp_ns: int, turn_rate: se3.Array, force: se3.Array, state: MotionState
+        self,
+        stamp_ns: int,
+        turn_rate: se3.Array,
+        force: se3.Array,
+        doubtful: bool,
+        state: MotionState,
     ) -> tuple[MotionState, None]:
         before_ns = state.imu_ns
         state = self.propagation.to(state, stamp_ns)
@@ -221,6 +234,7 @@ class VehicleEkf:
             turn_rate,
             force,
             stamp_ns,
+            doubtful,
             state.clones,
             state.memory,
         )

@@ -30,6 +30,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import SetBool, Trigger
 
 from cmrnet_ekf.ekf.ekf_settings import EkfSettings
+from cmrnet_ekf.ekf.frozen_imu import FrozenImu
 from cmrnet_ekf.ekf.gnss_start import GnssStartConfig, StartPose
 from cmrnet_ekf.ekf.observations import Observation
 from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
@@ -67,6 +68,12 @@ class EkfNodeConfig:
         choices=('world_to_base', 'map_to_odom', 'none'),
     )
     use_imu: bool = setting(True, 'move by imu; false: coast from observation to observation')
+    frozen_imu: int = setting(
+        10,
+        'samples in a row that repeat or lie on a line, after which imu is frozen: its samples are '
+        'guesses then; 0 for a simulated sensor without noise',
+        low=0,
+    )
     publish_rate: float = setting(
         50.0, 'outputs a second, at the stamps of the input; 0: at each', unit='Hz', low=0.0
     )
@@ -103,6 +110,7 @@ class EkfNode(Node):
         self.ekf: VehicleEkf | None = None
         self.T_body_base = np.eye(4)
         self._imu_frame = ''
+        self._frozen = FrozenImu(self.config.frozen_imu)
         self._guard = self._new_guard()
         self._late_samples = 0
         self._published_ns: int | None = None
@@ -139,7 +147,13 @@ class EkfNode(Node):
             self._jump(stamp_ns)
         assert self.ekf is not None
         try:
-            self.ekf.add_imu(stamp_ns, *imu_sample(message))
+            sample = imu_sample(message)
+            frozen = self._frozen.check(*sample)
+            self.diagnostics.count('imu samples frozen', int(frozen))
+            self.ekf.add_imu(stamp_ns, *sample, doubtful=frozen)
+            self.diagnostics.error(
+                'frozen', 'imu is frozen: its samples repeat' if frozen else None
+            )
         except DataError as error:
             self.reject('imu', 'unusable', str(error))
             self._late_samples += 'older' in str(error)
@@ -275,6 +289,7 @@ class EkfNode(Node):
         if self.ekf is not None:
             self.ekf.reset()
         self._guard = self._new_guard()
+        self._frozen.clear()
         self._late_samples, self._published_ns = 0, None
         self.sources.clear()
         self.health.restarted()
