@@ -116,6 +116,8 @@ def test_what_is_wrong_is_said(tmp_path):
         _ = ensemble.submap
     with pytest.raises(DataError, match='train one first'):
         EmbeddingEnsemble.load(tmp_path)
+    with pytest.raises(DataError, match='no such file of weights'):
+        EmbeddingEnsemble.load(tmp_path / 'other.safetensors')
     (tmp_path / 'best.safetensors').write_bytes(b'x' * 64)
     with pytest.raises(DataError, match='no weights for places'):
         EmbeddingEnsemble.load(tmp_path)

@@ -106,8 +106,8 @@ class SubmapRun:
             raise
         except (OSError, KeyError, ValueError, EOFError) as error:
             raise DataError(
-                f'{path} holds no run of submaps ({error}); expected an .npz file that '
-                'make_submap_runs wrote'
+                f'{path} holds no run of submaps ({type(error).__name__}); expected an .npz file '
+                'that make_submap_runs wrote'
             ) from None
         return SubmapRun(name, world, *arrays, facts)
 

@@ -42,6 +42,8 @@ def load_networks(
     Raises:
         DataError: the file holds none, or tensors do not fit the configuration.
     """
+    if not path.is_file():
+        raise DataError(f'{path}: no such file of weights; train_place_recognition makes them')
     try:
         stored = read(path, device)
     except DataError as error:
