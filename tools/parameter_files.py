@@ -48,7 +48,7 @@ _Parts = tuple[tuple[type, ...], dict[str, type]]
 
 def parameter_files() -> dict[Path, str]:
     """Return every parameter file's path and what it must hold, and the READMEs'."""
-    files = {}
+    files: dict[Path, str] = {}
     for package, nodes in _nodes().items():
         config, readme = ROOT / package / 'config', ROOT / package / 'README.md'
         files |= {config / f'{node}.yaml': _file(node, *parts) for node, parts in nodes.items()}
