@@ -21,6 +21,7 @@ setup(
     # because pip would look for packages of these names elsewhere.
     install_requires=[
         'filterpy',
+        'matplotlib',
         'numba',
         'numpy',
         'safetensors',
@@ -38,6 +39,8 @@ setup(
         'console_scripts': [
             'ekf = cmrnet_ekf.nodes.ekf_node:main',
             'build_lidar_map = cmrnet_ekf.mapping.build:main',
+            'make_cmrnet_samples = cmrnet_ekf.training.make:main',
+            'train_cmrnet = cmrnet_ekf.training.train:main',
         ],
     },
     zip_safe=False,

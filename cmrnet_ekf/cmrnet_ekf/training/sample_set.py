@@ -1,0 +1,131 @@
+"""Keep samples on the disk: images, LiDAR images seen from wrong guesses, and the guesses.
+
+facts.json     format, version, how the images were made, where they are from
+frames.npy     [F x H x W x 3] uint8, as the network takes them
+lidar.npy      [S x H x W] uint16 depth, 65535 is max_depth
+frame_of.npy   [S] which frame belongs to each LiDAR image
+guesses.npy    [S x 4 x 4] T_camera_guess, axes forward, left, up
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cmrnet_ekf.pose_sampling import targets
+from lcd_common.errors import DataError
+
+FORMAT, VERSION = 'cmrnet_samples', 1
+FULL_SCALE = 65535
+# What a mirror does to x y z roll pitch yaw.
+_MIRRORED = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a step of training sees: see `Cmrnet.trunk`; target [B x 6] of T_guess_camera."""
+
+    image: Tensor
+    lidar: Tensor
+    target: Tensor
+
+    def to(self, device: torch.device) -> 'Batch':
+        """Return the batch on a device."""
+        return Batch(self.image.to(device), self.lidar.to(device), self.target.to(device))
+
+
+class SampleSet:
+    """Samples of one drive; arrays stay on the disk until they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a set.
+
+        Raises:
+            DataError: there is none, or its parts do not fit together.
+        """
+        self.path = path
+        try:
+            self.facts: dict[str, Any] = json.loads((path / 'facts.json').read_text())
+            arrays = [
+                np.load(path / f'{name}.npy', mmap_mode='r', allow_pickle=False)
+                for name in ('frames', 'lidar', 'frame_of', 'guesses')
+            ]
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f'{path}: not a complete set of samples ({error}); make it with make_cmrnet_samples'
+            ) from error
+        self.frames, self.lidar, self.frame_of, self.guesses = arrays
+        if (self.facts.get('format'), self.facts.get('version')) != (FORMAT, VERSION):
+            raise DataError(
+                f'{path}: expected {FORMAT} of version {VERSION}; make the samples anew'
+            )
+        if not len(self.lidar) == len(self.frame_of) == len(self.guesses) > 0:
+            raise DataError(f'{path}: its parts have different lengths; make the samples anew')
+        self._targets = targets(np.asarray(self.guesses))
+
+    def __len__(self) -> int:
+        return len(self.frame_of)
+
+    @property
+    def images(self) -> tuple[float, ...]:
+        """Which images these are; see `CmrnetConfig.images`."""
+        return tuple(self.facts['images'])
+
+    def batch(self, index: NDArray[np.int64]) -> Batch:
+        """Return samples [B]."""
+        image = torch.from_numpy(self.frames[self.frame_of[index]]).permute(0, 3, 1, 2)
+        depth = self.lidar[index].astype(np.float32) * (self.facts['max_depth'] / FULL_SCALE)
+        return Batch(image, torch.from_numpy(depth), torch.from_numpy(self._targets[index]).float())
+
+
+def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment: bool) -> Batch:
+    """Return samples drawn from several sets, each sample as likely as any other.
+
+    With `augment` each is mirrored with a probability of a half, and its brightness, contrast and
+    saturation vary by a tenth, as CMRNet's.
+    """
+    ends = np.cumsum([len(one) for one in sets])
+    chosen = np.sort(rng.integers(0, ends[-1], count))
+    which = np.searchsorted(ends, chosen, side='right')
+    parts = [sets[k].batch(chosen[which == k] - (ends[k] - len(sets[k]))) for k in np.unique(which)]
+    batch = Batch(
+        torch.cat([p.image for p in parts]),
+        torch.cat([p.lidar for p in parts]),
+        torch.cat([p.target for p in parts]),
+    )
+    if not augment:
+        return batch
+    image = jittered(batch.image.float(), rng)
+    mirror = torch.from_numpy(rng.random(count) < 0.5)
+    return mirrored(Batch(image, batch.lidar, batch.target), mirror)
+
+
+def mirrored(batch: Batch, which: Tensor) -> Batch:
+    """Return the batch with some samples [B] as a mirror would show the street.
+
+    Both images are flipped: the flipped LiDAR image is what a camera with a mirrored principal
+    point sees of the mirrored map.
+    """
+    keep = which.view(-1, 1, 1, 1)
+    return Batch(
+        torch.where(keep, batch.image.flip(3), batch.image),
+        torch.where(keep[:, 0], batch.lidar.flip(2), batch.lidar),
+        torch.where(which.view(-1, 1), batch.target * _MIRRORED, batch.target),
+    )
+
+
+def jittered(image: Tensor, rng: np.random.Generator, amount: float = 0.1) -> Tensor:
+    """Return images [B x 3 x H x W], 0..255, with other brightness, contrast and saturation."""
+    factors = torch.from_numpy(rng.uniform(1 - amount, 1 + amount, (3, len(image), 1, 1, 1)))
+    brightness, contrast, saturation = factors.float()
+    image = image * brightness
+    image = (image - image.mean((1, 2, 3), keepdim=True)) * contrast + image.mean(
+        (1, 2, 3), keepdim=True
+    )
+    grey = image.mean(1, keepdim=True)
+    return ((image - grey) * saturation + grey).clamp(0.0, 255.0)
