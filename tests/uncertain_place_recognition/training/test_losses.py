@@ -6,6 +6,7 @@ import torch
 
 from uncertain_place_recognition.training.losses import (
     batch_hard_triplet,
+    contrastive,
     distances,
     distillation,
     gaussian_likelihood,
@@ -60,6 +61,7 @@ def test_gradients_are_numbers_where_embeddings_coincide_and_without_triplets():
             batch_hard_triplet(embeddings, *masks),
             lazy_quadruplet(embeddings, *masks, generator),
             truncated_smooth_ap(embeddings, *masks),
+            contrastive(embeddings, *masks),
         ):
             (gradient,) = torch.autograd.grad(found.loss, embeddings)
             assert torch.isfinite(gradient).all()
@@ -103,6 +105,21 @@ def test_smooth_average_precision_is_that_of_the_ranking_when_sharp():
     torch.autograd.gradcheck(
         lambda x: truncated_smooth_ap(x, positive, negative, temperature=0.3).loss, embeddings
     )
+
+
+def test_the_contrastive_loss_counts_every_negative_of_every_pair():
+    embeddings, positive, negative = _batch()
+    x = embeddings.detach().numpy()
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    losses, wrong = [], []
+    for a in range(12):
+        n_of = [float(x[a] @ x[n]) for n in range(12) if negative[a, n]]
+        p_of = [float(x[a] @ x[p]) for p in range(12) if positive[a, p]]
+        losses += [np.log1p(sum(np.exp((n - p) / 0.2) for n in n_of)) for p in p_of]
+        wrong += [max(n_of) > max(p_of)] if p_of else []
+    found = contrastive(embeddings, positive, negative, temperature=0.2)
+    assert float(found.loss.detach()) == pytest.approx(np.mean(losses), rel=1e-6)
+    assert found.active == pytest.approx(np.mean(wrong))
 
 
 def test_students_losses_against_their_formulas():

@@ -42,7 +42,7 @@ def _trainer(folder, network=None, **values):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize('loss', ['triplet', 'quadruplet', 'smooth_ap'])
+@pytest.mark.parametrize('loss', ['triplet', 'quadruplet', 'smooth_ap', 'contrastive'])
 def test_training_lowers_the_loss(tmp_path, loss):
     trainer = _trainer(tmp_path, steps=60, loss=loss, learning_rate=0.01)
     records = list(trainer.run())

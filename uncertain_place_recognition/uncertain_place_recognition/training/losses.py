@@ -13,7 +13,8 @@ class MetricLoss:
 
     Attributes:
         loss: scalar.
-        active: share of the anchors that still violate their margin; of smooth AP: 1 - recall@1.
+        active: share of the anchors that still violate their margin; of smooth AP and the
+            contrastive loss: whose nearest is a negative.
     """
 
     loss: Tensor
@@ -110,6 +111,32 @@ def truncated_smooth_ap(
     anchors = real[:, 0]
     missed = (similarity.masked_fill(~negative, -torch.inf).amax(1) > best[:, 0])[anchors]
     return MetricLoss(loss, float(missed.float().mean()) if len(missed) else 0.0)
+
+
+def contrastive(
+    embeddings: Tensor, positive: Tensor, negative: Tensor, temperature: float = 0.1
+) -> MetricLoss:
+    """Return the mean over positive pairs of log(1 + sum_n exp((s_n - s_p) / t)), s by cosine.
+
+    InfoNCE (van den Oord et al., 2018): every negative counts by how much it is alike, not the
+    hardest alone, so that small batches teach from the start.
+
+    Args:
+        embeddings: [B x D].
+        positive, negative: [B x B] masks.
+        temperature: t.
+    """
+    unit = functional.normalize(embeddings, dim=1)
+    scaled = unit @ unit.T / temperature
+    # Not minus infinity: of a row without a negative the sum would have no slope.
+    against = scaled.masked_fill(~negative, -1e4).logsumexp(1)
+    loss = functional.softplus(against[:, None] - scaled)[positive]
+    if not len(loss):
+        return MetricLoss(embeddings.sum() * 0.0, 0.0)
+    anchors = positive.any(1)
+    worst = scaled.masked_fill(~negative, -torch.inf).amax(1)
+    best = scaled.masked_fill(~positive, -torch.inf).amax(1)
+    return MetricLoss(loss.mean(), float((worst > best)[anchors].float().mean()))
 
 
 def distillation(student: Tensor, teacher: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from uncertain_place_recognition.training.embedded_runs import embed_runs, point
 from uncertain_place_recognition.training.losses import (
     MetricLoss,
     batch_hard_triplet,
+    contrastive,
     distances,
     distillation,
     gaussian_likelihood,
@@ -48,9 +49,10 @@ class TrainingConfig:
     )  # fmt: skip
     warmup: int = setting(50, 'batches over which the learning rate rises', low=0)
     loss: str = setting(
-        'triplet', 'batch-hard triplets, lazy quadruplets or smoothed average precision',
-        choices=('triplet', 'quadruplet', 'smooth_ap'),
-    )  # fmt: skip
+        'triplet',
+        'batch-hard triplets, lazy quadruplets, smoothed average precision, all negatives at once',
+        choices=('triplet', 'quadruplet', 'smooth_ap', 'contrastive'),
+    )
     margin: float = setting(0.2, 'of the triplet loss', low=0.0)
     teacher_sees: str = setting(
         'plain',
@@ -263,7 +265,9 @@ class Trainer:
             return batch_hard_triplet(embeddings, positive, negative, self.settings.margin)
         if self.settings.loss == 'quadruplet':
             return lazy_quadruplet(embeddings, positive, negative, generator)
-        return truncated_smooth_ap(embeddings, positive, negative)
+        if self.settings.loss == 'smooth_ap':
+            return truncated_smooth_ap(embeddings, positive, negative)
+        return contrastive(embeddings, positive, negative)
 
     def _student_loss(self, found: Embedding, chosen: NDArray[np.intp], points: Tensor) -> Tensor:
         if self._targets is not None:
