@@ -41,6 +41,11 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     run = _run(str(EXAMPLES / 'slam_in_one_process.py'), '--map', str(tmp_path / 'nothing'))
     assert run.returncode == 1
     assert 'found none; check the path' in run.stderr
+    script = str(EXAMPLES / 'slam_with_place_recognition.py')
+    run = _run(script, '--weights', str(tmp_path / 'nothing'))
+    assert run.returncode == 1
+    assert 'nothing does not exist: train an ensemble' in run.stderr
+    assert 'Traceback' not in run.stderr
 
 
 def test_the_composed_nodes_come_up_and_end_with_ctrl_c(ros: None) -> None:
