@@ -4,6 +4,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -191,3 +192,47 @@ def speed(samples: int = 20_000) -> dict[str, Any]:
         by_processor.append(len(drive.stamps_ns) / (time.process_time() - processor))
         by_wall.append(len(drive.stamps_ns) / (time.perf_counter() - wall))
     return {'imu_hz': float(np.median(by_processor)), 'imu_hz_wall_best': float(max(by_wall))}
+
+
+def order_invariance(seconds: float = 10.0) -> dict[str, Any]:
+    """Delay everything at random by up to a second; return how far the posteriors differ."""
+    drive = reference_drive(seconds)
+    imu = imu_of(drive, np.random.default_rng(0))
+    items: list[tuple[int, int | Observation]] = [
+        (stamp_ns, k) for k, stamp_ns in enumerate(drive.stamps_ns.tolist())
+    ]
+    items += [(s.stamp_ns, s) for s in observations(drive, np.random.default_rng(1))]
+    delays = np.random.default_rng(2).integers(0, 1_000_000_000, len(items))
+    results = []
+    for order in (delays * 0, delays):
+        ekf = begun(drive, np.random.default_rng(3), settings(gate=0.999))
+        arrivals = sorted(range(len(items)), key=lambda i: (items[i][0] + order[i], i))
+        for i in arrivals:
+            item = items[i][1]
+            if isinstance(item, int):
+                ekf.add_imu(items[i][0], imu.turn_rates[item], imu.forces[item])
+            else:
+                ekf.observe(item)
+        estimate = ekf.estimate()
+        assert estimate is not None
+        results.append(
+            np.concatenate([estimate.T_map_body.ravel(), estimate.state.covariance.ravel()])
+        )
+    return {
+        'delays_up_to_s': 1.0,
+        'order_difference': float(np.abs(results[0] - results[1]).max()),
+    }
+
+
+def section(_work: Path, runs: int = 50) -> dict[str, Any]:
+    """Measure everything about consistency."""
+    from benchmarks.nodes.ekf_recovery import recoveries
+
+    recovered = recoveries()
+    figures = {
+        **consistency(runs),
+        **order_invariance(),
+        'recovered': all(case['recovered'] for case in recovered.values()),
+        'recovery': recovered,
+    }
+    return {'consistency': figures, **speed()}

@@ -70,9 +70,15 @@ class PoseObservation:
         """Compare with a state."""
         R_sensor = state.R @ self.T_body_sensor[:3, :3]
         arm = self.T_body_sensor[:3, 3]
+        T_map_expected = se3.from_rotation_translation(R_sensor, state.p + state.R @ arm)
         residual = np.empty(6)
-        residual[:3] = self.T_map_sensor[:3, 3] - (state.p + state.R @ arm)
-        residual[3:] = se3.so3_log(self.T_map_sensor[:3, :3] @ R_sensor.T)
+        if all(self.axes):
+            # In the coordinates of the filter's own error, in which however large a step is exact.
+            xi = se3.log(se3.inverse(T_map_expected) @ self.T_map_sensor)
+            residual[:3], residual[3:] = R_sensor @ xi[:3], R_sensor @ xi[3:]
+        else:
+            residual[:3] = self.T_map_sensor[:3, 3] - T_map_expected[:3, 3]
+            residual[3:] = se3.so3_log(self.T_map_sensor[:3, :3] @ R_sensor.T)
         H = np.zeros((6, len(state.covariance)))
         H[:3, POSITION] = H[3:, ROTATION] = state.R
         H[:3, ROTATION] = -state.R @ se3.hat(arm)

@@ -110,6 +110,7 @@ class EkfNode(Node):
         self.ekf: VehicleEkf | None = None
         self.T_body_base = np.eye(4)
         self._imu_frame = ''
+        self._imu_astray = False
         self._frozen = FrozenImu(self.config.frozen_imu)
         self._guard = self._new_guard()
         self._late_samples = 0
@@ -310,6 +311,9 @@ class EkfNode(Node):
 
     def _knows_imu(self, frame: str) -> bool:
         if self.ekf is not None and frame == self._imu_frame:
+            if self._imu_astray:
+                self._imu_astray = False
+                self.diagnostics.error('imu transform', None)
             return True
         base_frame = self.config.base_frame
         T_body_base = self.transforms.lookup(frame, base_frame)
@@ -323,6 +327,7 @@ class EkfNode(Node):
         else:
             self._imu_frame = frame
             self._make_filter(T_body_base)
+        self._imu_astray = problem is not None
         self.diagnostics.error('imu transform', problem)
         return problem is None
 

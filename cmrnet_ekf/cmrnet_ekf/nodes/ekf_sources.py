@@ -50,10 +50,10 @@ _SAMPLES_HZ = 100.0
 class EkfInputsConfig:
     """Names of the inputs of each kind, separated by blanks; each has a group of its name."""
 
-    poses: str = setting('camera', 'absolute poses')
-    odometry: str = setting('odom', 'odometry')
-    twists: str = setting('', 'twists')
-    fixes: str = setting('gps', 'satellite fixes')
+    poses: str = setting('camera', 'names of the inputs that give poses')
+    odometry: str = setting('odom', 'names of the inputs that give odometry')
+    twists: str = setting('', 'names of the inputs that give twists')
+    fixes: str = setting('gps', 'names of the inputs that give satellite fixes')
 
 
 class EkfSources:
