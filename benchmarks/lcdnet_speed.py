@@ -91,7 +91,7 @@ def search_ms(size: int, length: int = _LENGTH) -> float:
 
 def index_ms(size: int, length: int = _LENGTH) -> float:
     """Return the median time of a query of the index that the node runs."""
-    index = DescriptorIndex(Euclidean(length), 0.0)
+    index = DescriptorIndex(Euclidean(length, unit_length=True), 0.0)
     rng = np.random.default_rng(0)
     for number, row in enumerate(_units(rng, size, length)):
         index.add(number, row, -np.inf)

@@ -48,6 +48,7 @@ setup(
             'run_drive = lcd_loop_closure.report.run_drive:main',
             'loop_statistics = lcd_loop_closure.report.loop_statistics:main',
             'train_lcdnet = lcd_loop_closure.lcdnet.train:main',
+            'train_lcdnet_place_head = lcd_loop_closure.lcdnet.train_place_head:main',
             'evaluate_loops = lcd_loop_closure.evaluation.evaluate_loops:main',
         ],
     },

@@ -55,6 +55,12 @@ class LcdnetConfig:
     feature_size: int = setting(640, 'D: numbers of a keypoint feature', low=4)
     clusters: int = setting(64, 'K: clusters of NetVLAD', low=2)
     descriptor_size: int = setting(256, 'G: numbers of the descriptor', low=4)
+    place_ranges: int = setting(
+        0,
+        'rings of distance from the sensor by which the descriptor tells keypoints apart; 0: none, '
+        'as in the thesis',
+        low=0,
+    )
     sinkhorn_iterations: int = setting(5, 'L of Algorithm 1', low=1)
 
     @property
@@ -75,6 +81,8 @@ class LcdnetConfig:
             raise ConfigError('channels and blocks need four numbers, one for each level')
         if any(not 0 <= source <= 4 for source in self.group_source):
             raise ConfigError('group_source is 0 (points) or 1 to 4 (levels)')
+        if self.place_ranges == 1:
+            raise ConfigError('place_ranges is 0 (none) or at least 2 rings')
         if self.z_high <= self.z_low:
             raise ConfigError('z_high must be above z_low')
         return self

@@ -1,6 +1,7 @@
 """Draw how a training goes."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,32 @@ def draw_curves(folder: Path) -> None:
         axis.grid(alpha=0.3)
         axis.set_xlabel('step')
     figure.savefig(folder / 'curves.png', dpi=90)
+    plt.close(figure)
+
+
+def draw_place_head(rows: Sequence[Mapping[str, float]], path: Path) -> None:
+    """Draw how the training of the place head goes: rows of step, loss and average precision."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    losses = [row for row in rows if 'loss' in row]
+    left.plot([row['step'] for row in losses], [row['loss'] for row in losses], '.-', label='loss')
+    left.plot(
+        [row['step'] for row in losses],
+        [row['confused'] for row in losses],
+        '.-',
+        label='share of confused loops',
+    )
+    left.legend()
+    right.plot([row['step'] for row in rows], [row['average_precision'] for row in rows], '.-')
+    right.set_title('average precision on validation drives')
+    for axis in (left, right):
+        axis.set_xlabel('step')
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=90)
     plt.close(figure)
 
 

@@ -65,6 +65,36 @@ def triplet_loss(
     return loss.mean(), float(violating.any(1).float().mean())
 
 
+def separation_loss(
+    descriptors: Tensor, same: Tensor, different: Tensor, temperature: float
+) -> tuple[Tensor, float]:
+    """Return how badly pairs of one place stand out from all pairs with other places.
+
+    Not in the thesis: log(1 + sum_n exp((s_n - s_p) / t)) for each pair p of one place, over all
+    pairs n of its first sweep with other places. Every negative of a large batch counts by how much
+    it is alike.
+
+    Args:
+        descriptors: [B x G], unit length.
+        same: [B x B] bool, pairs that show one place.
+        different: [B x B] bool, pairs that show two; those that are neither do not count.
+        temperature: t.
+
+    Returns:
+        The mean loss, and the share of pairs of one place that are less alike than a negative.
+    """
+    similarity = descriptors @ descriptors.T
+    scaled = similarity / temperature
+    # Not minus infinity: of a row without a negative the sum would have no slope.
+    against = scaled.masked_fill(~different, -1e4).logsumexp(1)
+    loss = torch.nn.functional.softplus(against[:, None] - scaled)[same]
+    if not len(loss):
+        return similarity.sum() * 0.0, 0.0
+    worst = similarity.detach().masked_fill(~different, -1.0).amax(1)
+    confused = (worst[:, None] > similarity.detach())[same]
+    return loss.mean(), float(confused.float().mean())
+
+
 def pose_loss(points: Tensor, T_predicted: Tensor, T_true: Tensor) -> Tensor:
     """Return how far points [P x N x 3] land from where they belong, mean L1 (equation 15)."""
     moved = _moved(T_predicted, points) - _moved(T_true, points)

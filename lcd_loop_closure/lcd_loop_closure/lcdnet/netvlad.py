@@ -6,6 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+# About as large as the features of a keypoint, which are several.
+_RING_WEIGHT = 2.0
+
 
 class NetVlad(nn.Module):
     """Aggregate features around learnt clusters (thesis equations 7 and 8), then compress."""
@@ -36,6 +39,24 @@ class NetVlad(nn.Module):
 def vlad_sums(features: Tensor, a: Tensor, centres: Tensor) -> Tensor:
     """Return V_k = sum_i a_k(f_i) (f_i - c_k) [B x K x D] (thesis equation 8)."""
     return a.transpose(1, 2) @ features - a.sum(1)[..., None] * centres
+
+
+def with_ranges(features: Tensor, keypoints: Tensor, rings: int, reach_m: float) -> Tensor:
+    """Add to features [B x N x D] how near their keypoints are to each of some rings.
+
+    Not in the thesis: a descriptor that sums up what there is, and not how far away, is nearly the
+    same a few metres on. Turning the sweep changes no distance.
+
+    Args:
+        features: to be widened to [B x N x D + rings].
+        keypoints: [B x N x 3], base frame, metres.
+        rings: number of them, from the sensor to `reach_m`.
+        reach_m: distance of the last one.
+    """
+    middle = torch.linspace(0.0, reach_m, rings, device=keypoints.device)
+    distance = torch.linalg.vector_norm(keypoints[..., :2].float(), dim=-1, keepdim=True)
+    near = torch.exp(-(((distance - middle) / (reach_m / (rings - 1))) ** 2))
+    return torch.cat([features, _RING_WEIGHT * near.to(features.dtype)], -1)
 
 
 class ContextGating(nn.Module):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
 from lcd_loop_closure.lcdnet.keypoints import above_ground, farthest_points
-from lcd_loop_closure.lcdnet.netvlad import NetVlad
+from lcd_loop_closure.lcdnet.netvlad import NetVlad, with_ranges
 from lcd_loop_closure.lcdnet.point_backbones import EdgeConv, PointNet, RandlaNet
 from lcd_loop_closure.lcdnet.pose_heads import RegressionHead
 from lcd_loop_closure.lcdnet.pyramid import VoxelPyramid
@@ -50,7 +50,7 @@ class Lcdnet(nn.Module):
             self.abstraction = VoxelSetAbstraction(s, self.pyramid.bev_size)
         else:
             self.of_points = _POINT_BACKBONES[s.backbone](s.feature_size, s.reach)
-        self.place = NetVlad(s.feature_size, s.clusters, s.descriptor_size)
+        self.place = NetVlad(s.feature_size + s.place_ranges, s.clusters, s.descriptor_size)
         self.transport: TransportHead | None = None
         if s.pose_head == 'uot':
             self.transport = TransportHead(s.sinkhorn_iterations)
@@ -81,9 +81,15 @@ class Lcdnet(nn.Module):
             features = features.view(clouds.size, number, -1)
         else:
             features = self.of_points(chosen.view(clouds.size, number, 3))
-        return Features(
-            chosen.view(clouds.size, number, 3), features, self.place(features), voxels.left_out
-        )
+        at = chosen.view(clouds.size, number, 3)
+        return Features(at, features, self.describe(features, at), voxels.left_out)
+
+    def describe(self, features: Tensor, keypoints: Tensor) -> Tensor:
+        """Return descriptors [B x G] of features [B x N x D] at keypoints [B x N x 3]."""
+        s = self.settings
+        if s.place_ranges:
+            features = with_ranges(features, keypoints, s.place_ranges, s.reach)
+        return self.place(features)
 
     def match(self, features: Features, source: Tensor, target: Tensor) -> SoftMatches | None:
         """Match clouds `source` [P] of a batch softly to clouds `target` [P].

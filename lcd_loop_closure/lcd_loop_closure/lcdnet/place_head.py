@@ -1,120 +1,144 @@
 """Train the place head alone, on features that are computed once: large batches cost little then.
 
 A batch of the whole network holds few places on a CPU, and few negatives teach little. With the
-backbone at rest, hundreds of sweeps fit in a batch.
+backbone at rest, many sweeps fit in a batch; they come in groups of neighbours, because what a
+drive must tell apart are the spots of one street.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
-from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig, augmented
-from lcd_loop_closure.lcdnet.losses import triplet_loss
+from lcd_loop_closure.evaluation.detection_protocols import (
+    PrecisionRecall,
+    candidates,
+    protocol_1,
+)
+from lcd_loop_closure.lcdnet.losses import separation_loss
 from lcd_loop_closure.lcdnet.network import Lcdnet
-from lcd_loop_closure.lcdnet.places import PlaceShard
-from lcd_loop_closure.lcdnet.voxels import Clouds
+from lcd_loop_closure.lcdnet.place_features import PlaceFeatures
+from lcd_loop_closure.revisits import RevisitConfig
 
 
 @config
 class PlaceHeadConfig:
     """How the place head is trained on its own."""
 
-    steps: int = setting(1500, 'batches', low=1)
-    places: int = setting(48, 'places of a batch', low=2)
+    steps: int = setting(800, 'batches', low=1)
+    groups: int = setting(6, 'neighbourhoods of a batch', low=1)
+    sweeps: int = setting(16, 'sweeps of a neighbourhood', low=2)
+    around: float = setting(50.0, 'how far its sweeps lie from its middle', unit='m', low=4.0)
+    same: float = setting(3.0, 'sweeps up to this far apart show one place', unit='m', low=0.1)
+    different: float = setting(4.5, 'sweeps farther apart show different places', unit='m', low=0.1)
+    returned: float = setting(
+        50.0, 'way between two sweeps that show a return to a place', unit='m', low=0.0
+    )
+    temperature: float = setting(0.05, 'of the similarities in the loss', low=1e-3)
     learning_rate: float = setting(0.001, "Adam's, at the start; falls to a hundredth", low=1e-7)
     weight_decay: float = setting(5e-6, "Adam's", low=0.0)
-    margin: float = setting(0.5, 'm of the triplet loss; negatives are the hardest', low=0.0)
-    different: float = setting(
-        10.0, 'sweeps farther apart show different places', unit='m', low=0.1
-    )
     seed: int = setting(0, 'of everything drawn', low=0)
-
-
-@dataclass(frozen=True)
-class PlaceFeatures:
-    """Keypoint features of places, computed once.
-
-    Attributes:
-        values: [P x S x N x D] float16, of S sweeps of each place; the first two are a loop.
-        position: [P x S x 3] metres.
-        town: [P].
-    """
-
-    values: Tensor
-    position: NDArray[np.float64]
-    town: NDArray[np.int64]
-
-
-@torch.no_grad()
-def place_features(
-    network: Lcdnet,
-    shards: Sequence[PlaceShard],
-    augmentation: AugmentationConfig,
-    *,
-    seed: int = 0,
-    progress: Callable[[], None] = lambda: None,
-) -> PlaceFeatures:
-    """Return the features of all places of the shards, each sweep augmented once.
-
-    Raises:
-        ConfigError: there are no shards.
-    """
-    if not shards:
-        raise ConfigError('expected the places of at least one town')
-    network.eval()
-    device = next(network.parameters()).device
-    rng = np.random.default_rng([seed, 97])
-    values, position, towns = [], [], []
-    for shard in shards:
-        for number in range(len(shard)):
-            place = shard.place(number)
-            blind = rng.random() < augmentation.no_intensity_share
-            sweeps = [augmented(sweep, augmentation, rng) for sweep in place.sweeps]
-            clouds = Clouds.of(
-                [torch.from_numpy(one.xyz).to(device) for one in sweeps],
-                [None if blind else torch.from_numpy(one.intensity).to(device) for one in sweeps],
-            )
-            values.append(network(clouds).features.half().cpu())
-            position.append([sweep.T_world_base[:3, 3] for sweep in place.sweeps])
-            towns.append(place.town)
-            progress()
-    return PlaceFeatures(torch.stack(values), np.array(position), np.array(towns, np.int64))
 
 
 def train_place_head(
     network: Lcdnet, features: PlaceFeatures, settings: PlaceHeadConfig
 ) -> Iterator[tuple[int, float, float]]:
-    """Train the place head; yield step, loss and the share of violated triplets."""
+    """Train the place head; yield step, loss and the share of loops less alike than a negative."""
     s, head = settings, network.place
     device = next(head.parameters()).device
     optimizer = torch.optim.Adam(head.parameters(), s.learning_rate, weight_decay=s.weight_decay)
+    middles = Neighbourhoods(features, s)
     head.train()
     for step in range(s.steps):
-        rng = np.random.default_rng([s.seed, step, 101])
-        chosen = rng.choice(len(features.town), min(s.places, len(features.town)), replace=False)
-        values = features.values[torch.from_numpy(chosen)].to(device).float()
-        places, sweeps = values.shape[:2]
-        descriptors = head(values.flatten(0, 1))
-        at = features.position[chosen].reshape(-1, 3)
-        town = np.repeat(features.town[chosen], sweeps)
-        apart = np.linalg.norm(at[:, None] - at[None], axis=2) > s.different
-        different = torch.from_numpy(apart | (town[:, None] != town[None])).to(device)
-        first = torch.arange(places, device=device) * sweeps
-        # Either sweep of a loop may be the anchor.
-        anchor, positive = torch.cat([first, first + 1]), torch.cat([first + 1, first])
-        loss, violated = triplet_loss(
-            descriptors, anchor, positive, different, s.margin, hardest=True
+        chosen = middles.draw(np.random.default_rng([s.seed, step, 101]))
+        rows = torch.from_numpy(chosen)
+        descriptors = network.describe(
+            features.values[rows].to(device).float(), features.keypoints[rows].to(device).float()
+        )
+        same, different = middles.relations(chosen)
+        loss, confused = separation_loss(
+            descriptors,
+            torch.from_numpy(same).to(device),
+            torch.from_numpy(different).to(device),
+            s.temperature,
         )
         for group in optimizer.param_groups:
             group['lr'] = s.learning_rate * (0.505 + 0.495 * np.cos(np.pi * step / s.steps))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        yield step + 1, float(loss.detach()), violated
+        yield step + 1, float(loss.detach()), confused
     head.eval()
+
+
+class Neighbourhoods:
+    """Draw sweeps around spots that a drive returned to."""
+
+    def __init__(self, features: PlaceFeatures, settings: PlaceHeadConfig) -> None:
+        """Look for the spots.
+
+        Raises:
+            ConfigError: no drive returns to a place.
+        """
+        self._settings = settings
+        self._position = features.position.numpy()
+        self._town, self._path_m = features.town.numpy(), features.path_m.numpy()
+        self._rows = {int(t): np.flatnonzero(self._town == t) for t in np.unique(self._town)}
+        loops = [rows[self._same(rows, rows).any(1)] for rows in self._rows.values()]
+        self._loops = np.concatenate(loops)
+        if not len(self._loops):
+            raise ConfigError('none of the drives returns to a place: nothing can be learnt')
+
+    def draw(self, rng: np.random.Generator) -> NDArray[np.intp]:
+        """Return the rows of a batch: each neighbourhood has a loop at least."""
+        s, groups = self._settings, []
+        for middle in rng.choice(self._loops, s.groups):
+            rows = self._rows[int(self._town[middle])]
+            partners = rows[self._same(np.array([middle]), rows)[0]]
+            away = np.linalg.norm(self._position[rows] - self._position[middle], axis=1)
+            near = rows[away <= s.around]
+            others = rng.choice(near, min(s.sweeps - 2, len(near)), replace=False)
+            groups.append([middle, rng.choice(partners), *others])
+        return np.unique(np.concatenate(groups)).astype(np.intp)
+
+    def relations(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which of the sweeps [B x B] are returns to one place, and which are different."""
+        town = self._town[rows]
+        away = np.linalg.norm(self._position[rows][:, None] - self._position[rows], axis=2)
+        different = (away > self._settings.different) | (town[:, None] != town)
+        return self._same(rows, rows), different
+
+    def _same(self, a: NDArray[np.intp], b: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return whether rows a are returns to the places of rows b [A x B]."""
+        s = self._settings
+        away = np.linalg.norm(self._position[a][:, None] - self._position[b], axis=2)
+        path = np.abs(self._path_m[a][:, None] - self._path_m[b])
+        own = self._town[a][:, None] == self._town[b]
+        return np.asarray(own & (away <= s.same) & (path > s.returned))
+
+
+@torch.inference_mode()
+def judge_place_head(network: Lcdnet, features: PlaceFeatures) -> PrecisionRecall:
+    """Return precision and recall by protocol 1 on one drive, its features not augmented.
+
+    Of a drive with a sweep each three metres the latest 17 are left out, the 50 metres that 50
+    scans of a sweep each metre are.
+    """
+    head = network.place.eval()
+    device = next(head.parameters()).device
+    parts = [
+        network.describe(values.to(device).float(), at.to(device).float()).cpu()
+        for values, at in zip(features.values.split(32), features.keypoints.split(32), strict=True)
+    ]
+    descriptors = torch.cat(parts).numpy()
+    gap = float(np.median(np.diff(features.path_m.numpy())))
+    late = max(1, round(50.0 / max(gap, 0.1)))
+    found = candidates(
+        lambda i, m: np.linalg.norm(descriptors[:m] - descriptors[i], axis=1),
+        features.position.numpy(),
+        RevisitConfig(excluded_scans=late, first_scan=2 * late),
+    )
+    return protocol_1(found)

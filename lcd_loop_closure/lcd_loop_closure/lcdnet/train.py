@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,14 @@ import torch
 from tqdm import tqdm
 
 from lcd_common.command_line import run
-from lcd_common.errors import ConfigError
 from lcd_loop_closure.lcdnet import checkpoint
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.config import COMPACT, FULL, LcdnetConfig
 from lcd_loop_closure.lcdnet.curves import draw_curves
 from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
-from lcd_loop_closure.lcdnet.place_head import (
-    PlaceHeadConfig,
-    place_features,
-    train_place_head,
-)
 from lcd_loop_closure.lcdnet.places import PlaceShard, simulated_shard
+from lcd_loop_closure.lcdnet.setting_changes import changed
 from lcd_loop_closure.lcdnet.training import Trainer, TrainingConfig
 from lcd_loop_closure.lcdnet.validation import validate
 
@@ -53,7 +48,6 @@ _EXAMPLES = """
 examples:
   train_lcdnet --out runs/compact                          the model that ships, on two CPU cores
   train_lcdnet --out runs/compact --minutes 60             an hour of it; the same again goes on
-  train_lcdnet --out runs/compact --place-head             then its place head, in large batches
   train_lcdnet --network full --out runs/full --device cuda
   torchrun --nproc-per-node 4 -m lcd_loop_closure.lcdnet.train --network full --out runs/full
   train_lcdnet --out runs/d64 --set feature_size=64        one row of the ablation tables
@@ -74,9 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _train(arguments: argparse.Namespace) -> None:
     network_settings, training = _NETWORKS[arguments.network]
-    network_settings = _changed(network_settings, arguments.set)
-    if not arguments.place_head:
-        training = _changed(training, arguments.train)
+    network_settings = changed(network_settings, arguments.set)
+    training = changed(training, arguments.train)
     torch.set_num_threads(arguments.threads or torch.get_num_threads())
     device, rank, processes = _join(arguments.device)
     out: Path = arguments.out
@@ -90,9 +83,6 @@ def _train(arguments: argparse.Namespace) -> None:
         torch.distributed.barrier()
     shards = [PlaceShard.load(shard_path(data, town)) for town in towns]
     held_out = [PlaceShard.load(shard_path(data, town)) for town in judged]
-    if arguments.place_head:
-        _train_head(shards, held_out, arguments, device)
-        return
     torch.manual_seed(training.seed)
     network = Lcdnet(network_settings)
     trainer = Trainer(
@@ -117,34 +107,6 @@ def _train(arguments: argparse.Namespace) -> None:
         if rank == 0 and (record.step % arguments.validate_every == 0 or last):
             _judge(trainer.network, trainer.step, asdict(training), held_out, arguments)
     bar.close()
-
-
-def _train_head(
-    shards: Sequence[PlaceShard],
-    held_out: Sequence[PlaceShard],
-    arguments: argparse.Namespace,
-    device: torch.device,
-) -> None:
-    """Train the place head of the best network on features that are computed once."""
-    best = arguments.out / 'best.safetensors'
-    if not best.is_file():
-        raise ConfigError(f'--place-head goes on from {best}: train the network there first')
-    network, facts = checkpoint.load_network(best, device)
-    settings = _changed(PlaceHeadConfig(), arguments.train)
-    total = sum(len(shard) for shard in shards)
-    with tqdm(total=total, unit='place', desc='features', disable=arguments.quiet) as bar:
-        features = place_features(
-            network, shards, AugmentationConfig(), progress=lambda: _advance(bar)
-        )
-    training = {**facts['training'], 'place_head': asdict(settings)}
-    begin = int(facts['validation']['step'])
-    with tqdm(total=settings.steps, unit='step', desc='place head', disable=arguments.quiet) as bar:
-        for step, loss, violated in train_place_head(network, features, settings):
-            bar.update()
-            bar.set_postfix(loss=f'{loss:.3f}', violated=f'{violated:.2f}')
-            if step % arguments.validate_every == 0 or step == settings.steps:
-                _judge(network, begin + step, training, held_out, arguments)
-                network.place.train()
 
 
 def _judge(
@@ -200,33 +162,6 @@ def _advance(bar: Any) -> None:
     bar.update()
 
 
-def _changed(settings: Any, changes: Sequence[str]) -> Any:
-    """Return settings with `name=value` changes; raises ConfigError for what there is not."""
-    known = {field.name: field.default for field in fields(settings)}
-    values = {}
-    for change in changes:
-        name, equals, text = change.partition('=')
-        if not equals or name not in known:
-            raise ConfigError(f'{change!r} is no setting; expected NAME=VALUE, NAME one of: '
-                              + ', '.join(sorted(known)))  # fmt: skip
-        try:
-            values[name] = _value(text, known[name])
-        except ValueError:
-            kind = type(known[name]).__name__
-            raise ConfigError(f'{change!r}: expected a value of type {kind}') from None
-    return replace(settings, **values)
-
-
-def _value(text: str, like: Any) -> Any:
-    if isinstance(like, bool):
-        if text.lower() not in ('true', 'false'):
-            raise ValueError
-        return text.lower() == 'true'
-    if isinstance(like, tuple):
-        return tuple(type(like[0])(part) for part in text.split(',') if part)
-    return type(like)(text)
-
-
 def _join(device: str) -> tuple[torch.device, int, int]:
     """Return the device, rank and number of processes; joins torchrun's group if there is one."""
     processes = int(os.environ.get('WORLD_SIZE', '1'))
@@ -260,11 +195,6 @@ def _parser() -> argparse.ArgumentParser:
     add('--threads', type=int, help='of the CPU (default: all)')
     add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the network')
     add('--train', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the training')
-    add(
-        '--place-head',
-        action='store_true',
-        help='train the place head of the best network in --out further, in large batches',
-    )
     add('--quiet', action='store_true', help='no progress bars')
     return parser
 

@@ -10,10 +10,8 @@ from lcdnet_samples import TINY, street_shard
 
 from lcd_common.errors import ConfigError, DataError
 from lcd_loop_closure.lcdnet import Lcdnet, checkpoint, train
-from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.curves import draw_curves
 from lcd_loop_closure.lcdnet.device import choose_device
-from lcd_loop_closure.lcdnet.place_head import PlaceHeadConfig, place_features, train_place_head
 from lcd_loop_closure.lcdnet.training import Trainer, TrainingCollapsedError, TrainingConfig
 from lcd_loop_closure.lcdnet.validation import validate
 from lcd_loop_closure.lcdnet.voxels import Clouds
@@ -146,19 +144,3 @@ def test_mistakes_are_one_line(tmp_path, capsys):
     assert 'expected a value of type int' in capsys.readouterr().err
     with pytest.raises(ConfigError, match='device must be'):
         choose_device('abacus')
-
-
-def test_the_place_head_learns_on_its_own_and_nothing_else_changes():
-    network = _network()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    features = place_features(network, SHARDS, AugmentationConfig())
-    assert features.values.shape == (8, 3, 48, 16)
-    settings = PlaceHeadConfig(steps=80, places=6, learning_rate=0.005)
-    losses = [loss for _, loss, _ in train_place_head(network, features, settings)]
-    assert np.mean(losses[-15:]) < 0.8 * np.mean(losses[:15])
-    changed = {
-        name for name, value in network.state_dict().items() if not torch.equal(value, before[name])
-    }
-    assert changed and all(name.startswith('place.') for name in changed)
-    with pytest.raises(ConfigError, match='at least one town'):
-        place_features(network, [], AugmentationConfig())
