@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from lcd_common.errors import DataError, MapError
 from lcd_common.settings import config, setting
 
-# Bets of 1 + e (p - 1/2) on each p-value: that they are small, moderately so, or as they should be.
-_BETS = np.array([-1.9, -1.0, 0.0])
+# Bets of k p^(k - 1) on each p-value, from "tiny" to "as it should be" (k = 1 stakes nothing).
+_BETS = np.array([0.1, 0.3, 0.6, 1.0])
 _MOST = 1000
 
 
@@ -136,7 +136,7 @@ class DriftAlarm:
         jump, limit = self.settings.jump, self.settings.limit
         total = float(self._stakes.sum())
         stakes = (1.0 - jump) * self._stakes + jump * total / len(_BETS)
-        stakes = stakes * (1.0 + _BETS * (p_value - 0.5))
+        stakes = stakes * _BETS * p_value ** (_BETS - 1.0)
         evidence = float(stakes.sum())
         if evidence < 1.0:
             stakes, evidence = np.full(len(_BETS), 1.0 / len(_BETS)), 1.0

@@ -48,24 +48,29 @@ class LockStep:
         Raises:
             ConfigError: a node works on a thread of its own.
         """
-        self.nodes = list(nodes)
+        self.nodes: list[Node] = []
         self.delivered: Counter[str] = Counter()
         self._fire_timers = fire_timers
         self._now_ns: int | None = None
         self._queue: deque[tuple[str, Any, Any]] = deque()
         self._draining = False
         self._observers: dict[str, list[tuple[Callable[[Any], None], bool]]] = defaultdict(list)
-        for node in self.nodes:
-            if node.has_parameter('threaded') and node.get_parameter('threaded').value:
-                raise ConfigError(
-                    f'lock-step replay needs threaded:=false, but node '
-                    f'{node.get_fully_qualified_name()} has it true'
-                )
-            node.set_parameters([Parameter('use_sim_time', value=True)])
-            for publisher in node.publishers:
-                self._take_over(publisher)
-            create = node.create_publisher
-            node.create_publisher = partial(self._created, create)  # those made later
+        for node in nodes:
+            self.add(node)
+
+    def add(self, node: Node) -> None:
+        """Take one more node in, before the replay begins; raises ConfigError as the others do."""
+        if node.has_parameter('threaded') and node.get_parameter('threaded').value:
+            raise ConfigError(
+                f'lock-step replay needs threaded:=false, but node '
+                f'{node.get_fully_qualified_name()} has it true'
+            )
+        self.nodes.append(node)
+        node.set_parameters([Parameter('use_sim_time', value=True)])
+        for publisher in node.publishers:
+            self._take_over(publisher)
+        create = node.create_publisher
+        node.create_publisher = partial(self._created, create)  # those made later
 
     def listen(self, topic: str, callback: Callable[[Any], None], *, raw: bool = False) -> None:
         """Call back with every message of an absolute topic.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,11 @@ from numpy.typing import NDArray
 
 from uncertain_place_recognition.evaluation.bootstrap import drawn_pairs, interval
 from uncertain_place_recognition.evaluation.failure import (
+    aurc,
+    auroc,
     failure_detection,
+    false_positive_rate,
+    recall_at_precision,
     removal_curve,
     risk_coverage,
 )
@@ -35,7 +40,12 @@ SCORES = {
 }
 REMOVED = np.linspace(0.0, 0.9, 19)
 DRAWS = 200
-_WITH_INTERVAL = ('auroc', 'aurc', 'fpr95', 'recall_at_p99')
+_WITH_INTERVAL = {
+    'auroc': auroc,
+    'aurc': aurc,
+    'fpr95': false_positive_rate,
+    'recall_at_p99': partial(recall_at_precision, precision=0.99),
+}
 
 
 @dataclass(frozen=True)
@@ -96,13 +106,12 @@ def judge_score(
     wrong = [~hits[1] for _, _, hits in parts]
     figures = failure_detection(np.concatenate(values), np.concatenate(wrong)).plain()
     drawn = [
-        failure_detection(
-            np.concatenate([values[k] for k in chosen]), np.concatenate([wrong[k] for k in chosen])
-        ).plain()
+        (np.concatenate([values[k] for k in chosen]), np.concatenate([wrong[k] for k in chosen]))
         for chosen in drawn_pairs(names, DRAWS)
     ]
-    for name in _WITH_INTERVAL:
-        ends = interval([one[name] for one in drawn if one[name] is not None])
+    drawn = [(doubt, failed) for doubt, failed in drawn if failed.any() and not failed.all()]
+    for name, figure in _WITH_INTERVAL.items():
+        ends = interval([figure(doubt, failed) for doubt, failed in drawn])
         figures[f'{name}_low'], figures[f'{name}_high'] = ends or (None, None)
     coverage, risk = risk_coverage(np.concatenate(values), np.concatenate(wrong))
     return JudgedScore(

@@ -1,0 +1,148 @@
+"""Interchange of members, recall, failure detection and promised rates (thesis 4.3)."""
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.place_sets import ARCHITECTURES, CALIBRATION, SETS, TestSet, embedded, shortened
+from uncertain_place_recognition.calibration import Calibrated, calibrate
+from uncertain_place_recognition.drift_alarm import DriftAlarm
+from uncertain_place_recognition.embedded_run import EmbeddedRun
+from uncertain_place_recognition.evaluation.figures import write_pictures
+from uncertain_place_recognition.evaluation.guarantee import observe
+from uncertain_place_recognition.evaluation.interchange import interchange
+from uncertain_place_recognition.evaluation.pairs import PairConfig, available, judge_pairs
+from uncertain_place_recognition.evaluation.recall import recall
+from uncertain_place_recognition.evaluation.study import (
+    interchange_figures,
+    recall_figures,
+    study,
+)
+from uncertain_place_recognition.query_table import QueryTable, query_table
+
+TARGETS = (0.01, 0.05)
+# Tables and curves of all methods are of this one; both are in the interchange.
+MAIN = 'minkloc3d'
+
+
+def exchanged(work: Path, quick: bool = False) -> dict[str, Any]:
+    """Return recall between members trained by triplets and by distillation (Tables 4.1, 4.2)."""
+    figures: dict[str, Any] = {}
+    for architecture in ARCHITECTURES:
+        runs = embedded('town', _set('town', quick), architecture, work, ('students', 'naive'))
+        for name, role in (('triplet', 'naive'), ('distilled', 'students')):
+            found = interchange(runs, role)
+            assert found is not None
+            figures.setdefault(name, {})[architecture] = interchange_figures(found)
+    return {'interchange': figures}
+
+
+def recalls(work: Path, quick: bool = False) -> dict[str, Any]:
+    """Return the recall of all methods on all sets, by cosine and by Euclidean distance."""
+    figures: dict[str, Any] = {'recall': {}, 'recall_euclidean': {}}
+    for name in SETS:
+        runs = embedded(name, _set(name, quick), MAIN, work)
+        for key, metric in (('recall', 'cosine'), ('recall_euclidean', 'euclidean')):
+            figures[key][name] = _recall_of(runs, metric)
+    return figures
+
+
+def failures(work: Path, quick: bool = False) -> dict[str, Any]:
+    """Return how well doubts find wrong matches, with and without places the map does not have."""
+    table, calibrated = _calibration(work, quick)
+    figures: dict[str, Any] = {'failure': {}, 'failure_open_set': {}, 'probability': {}}
+    for name in SETS:
+        runs = embedded(name, _set(name, quick), MAIN, work)
+        known = study(runs, PairConfig(), calibrated.model)
+        unknown = study(runs, PairConfig(), calibrated.model, open_set=True, no_match_share=0.3)
+        figures['failure'][name] = known.plain()['failure']
+        figures['failure_open_set'][name] = unknown.plain()['failure']
+        figures['probability'][name] = known.plain()['probability']
+        write_pictures(known, work / 'pictures' / name)
+        write_pictures(unknown, work / 'pictures' / f'{name}_open_set')
+    figures['probability']['calibration_runs'] = {
+        'ece': calibrated.reliability.ece,
+        'brier': calibrated.reliability.brier,
+    }
+    figures['failure_fitted_to'] = {'runs': len(table.runs), 'queries': len(table)}
+    return figures
+
+
+def guarantee(work: Path, quick: bool = False) -> dict[str, Any]:
+    """Return promised rates on resplits of runs, and what a foreign town does to them."""
+    table, calibrated = _calibration(work, quick)
+    found = observe(table, TARGETS, resplits=20 if quick else 100)
+    figures: dict[str, Any] = {
+        'queries': len(table),
+        'no_match': int((~table.known).sum()),
+        'runs': len(table.runs),
+        'database_size': table.database_size,
+        'drift_false_alarms': calibrated.false_alarms,
+    }
+    for one in found:
+        key = f'target_{round(100 * one.target):02d}'
+        plain = one.plain()
+        if one.kind == 'false_match_rate':
+            figures[key] = {**plain, **figures.get(key, {})}
+        figures.setdefault(key, {})[one.kind] = plain
+    figures['elsewhere'] = {
+        name: _elsewhere(calibrated, embedded(name, _set(name, quick), MAIN, work)) for name in SETS
+    }
+    return {'guarantee': figures}
+
+
+def _elsewhere(calibrated: Calibrated, runs: list[EmbeddedRun]) -> dict[str, Any]:
+    """Return what the alarm does on runs, and the rates with and without minding it."""
+    table = query_table(runs)
+    belief = calibrated.model.belief(table.features)
+    minded = np.zeros(len(table), bool)
+    first: list[int | None] = []
+    for number in table.runs:
+        alarm, rows = DriftAlarm(calibrated.drift), np.flatnonzero(table.run == number)
+        rung = np.array([alarm.update(u).alarm for u in table.features[rows, 1]])
+        minded[rows] = rung
+        first.append(int(np.argmax(rung)) if rung.any() else None)
+    rung_after = [one for one in first if one is not None]
+    figures: dict[str, Any] = {
+        'runs': len(first),
+        'runs_with_alarm': len(rung_after),
+        'queries_until_alarm': float(np.median(rung_after)) if rung_after else None,
+        'share_under_alarm': float(minded.mean()),
+        'database_size': table.database_size,
+        'wrong': int(table.wrong.sum()),
+    }
+    for target in TARGETS:
+        accepted = calibrated.acceptance('false_match_rate', target).accepts(belief)
+        figures[f'target_{round(100 * target):02d}'] = {
+            'ignoring_the_alarm': _rate(accepted, table),
+            'minding_the_alarm': _rate(accepted & ~minded, table),
+            'accepted_right': float(accepted[~table.wrong].mean()),
+        }
+    return figures
+
+
+def _rate(accepted: np.ndarray, table: QueryTable) -> float:
+    return float((accepted & table.wrong).sum() / max(int(table.wrong.sum()), 1))
+
+
+def _recall_of(runs: list[EmbeddedRun], metric: str) -> dict[str, Mapping[str, Any]]:
+    found = {
+        name: recall(judge_pairs(runs, name, PairConfig(metric=metric))) for name in available(runs)
+    }
+    return {name: recall_figures(one) for name, one in found.items() if one is not None}
+
+
+def _set(name: str, quick: bool) -> TestSet:
+    return shortened(SETS[name]) if quick else SETS[name]
+
+
+@cache
+def _calibration(work: Path, quick: bool) -> tuple[QueryTable, Calibrated]:
+    chosen = CALIBRATION
+    if quick:
+        chosen = TestSet(CALIBRATION.seeds[:4], 3, 500.0)
+    table = query_table(embedded('calibration', chosen, MAIN, work, ('students',)))
+    return table, calibrate(table, TARGETS)

@@ -1,0 +1,250 @@
+"""Place recognition on real sweeps, none of which the shipped ensemble was trained or chosen on."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bags.drives import open_drive
+from benchmarks.loop_pairs import TRUE_PAIR, clouds, kitti_00
+from benchmarks.place_speed import median_ms
+from benchmarks.recordings import folder, karlsruhe_out_and_back
+from lcd_common import se3
+from lcd_common.cloud import PointCloud
+from lcd_common.errors import DataError
+from lcd_common.trajectory import Trajectory
+from lcd_loop_closure.evaluation.sweep_views import without_sector
+from uncertain_place_recognition.evaluation.failure import auroc
+from uncertain_place_recognition.evaluation.figures import figure
+from uncertain_place_recognition.opened import open_recognizer
+from uncertain_place_recognition.place_recognizer import PlaceRecognizer
+from uncertain_place_recognition.uncertainty import total_uncertainty
+
+_MOUNT = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 1.73])
+_SAME_PLACE_M = 25.0
+
+
+def evaluate(work: Path, step: int = 3) -> dict[str, Any]:
+    """Measure all of this; `step` takes every n-th Karlsruhe sweep for changed inputs."""
+    figures = {
+        'kitti_00': true_pair(),
+        'kitti_360_one_place': one_place(),
+        'changed_inputs': changed_inputs(work, step),
+    }
+    # A process of its own: the first odometry of a process decides on KISS-ICP's threads.
+    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
+        figures['out_and_back'] = pool.submit(_through_the_node, work).result()
+    return {'real': figures}
+
+
+def true_pair() -> dict[str, Any]:
+    """Ask where KITTI 00's scan 4501 is, in a map of the other scans, in any heading."""
+    scans, T_world_base = kitti_00()
+    recognizer = recognizer_of_this()
+    for number, cloud in sorted(scans.items()):
+        if number != TRUE_PAIR[1]:
+            recognizer.add(
+                _in_base(cloud), T_world_base[number], stamp_ns=number * 10**8, id=number
+            )
+    recognizer = _all_searchable(recognizer)
+    query, right, answers = _in_base(scans[TRUE_PAIR[1]]), 0, []
+    for yaw in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False):
+        answer = recognizer.locate(query.transformed(se3.rotation_z(float(yaw))))
+        assert answer.best is not None
+        right += answer.best.place_id == TRUE_PAIR[0]
+        answers.append(answer)
+    first = answers[0]
+    assert first.best is not None
+    return {
+        'places': len(recognizer),
+        'headings': len(answers),
+        'right': right,
+        'match_as_driven': first.best.place_id,
+        'similarity_as_driven': first.best.similarity,
+        'uncertainty_as_driven': first.uncertainty_normalised,
+        'accepted_as_driven': first.best.accepted,
+        'embed_ms': median_ms(lambda: recognizer.embed(query), 5),
+    }
+
+
+def one_place() -> dict[str, Any]:
+    """Compare KITTI-360's 24 frames: they span 23.5 m and are one place, not a test of recall."""
+    recognizer = recognizer_of_this()
+    members = np.array(
+        [recognizer.embed(_in_base(cloud)) for cloud in clouds(folder() / 'data' / 'kitti_360')]
+    )
+    mean = members.mean(1)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    similarity = (mean @ mean.T)[np.triu_indices(len(mean), 1)]
+    uncertainty = total_uncertainty(members)
+    return {
+        'frames': len(members),
+        'least_similarity': float(similarity.min()),
+        'mean_similarity': float(similarity.mean()),
+        'mean_uncertainty': float(uncertainty.mean()),
+    }
+
+
+def changed_inputs(work: Path, step: int) -> dict[str, Any]:
+    """Return how well uncertainty tells changed sweeps from clean ones (Karlsruhe, AUROC)."""
+    recognizer = recognizer_of_this()
+    sweeps = list(clouds(karlsruhe_out_and_back(work).parents[1]))[::step]
+    rng = np.random.default_rng(0)
+    views: dict[str, Callable[[PointCloud], PointCloud]] = {
+        'clean': lambda cloud: cloud,
+        'sector_90': lambda cloud: without_sector(cloud, float(rng.uniform(-3.1, 3.1)), np.pi / 2),
+        'sector_180': lambda cloud: without_sector(cloud, float(rng.uniform(-3.1, 3.1)), np.pi),
+        'sixteen_beams': _sixteen_beams,
+    }
+    found = {name: _uncertainties(recognizer, sweeps, view) for name, view in views.items()}
+    clean = found.pop('clean')
+    figures: dict[str, Any] = {'sweeps': len(clean), 'clean_uncertainty': float(np.median(clean))}
+    for name, values in found.items():
+        changed = np.r_[np.zeros(len(clean), bool), np.ones(len(values), bool)]
+        figures[name] = {
+            'uncertainty': float(np.median(values)),
+            'auroc': auroc(np.r_[clean, values], changed),
+            'too_few_points': len(sweeps) - len(values),
+        }
+    return figures
+
+
+def recognizer_of_this() -> PlaceRecognizer:
+    """Return a recognizer with $PLACE_ENSEMBLE, or the ensemble that ships."""
+    return open_recognizer(
+        os.environ.get('PLACE_ENSEMBLE', ''), os.environ.get('PLACE_CALIBRATION', '')
+    )
+
+
+def _through_the_node(work: Path) -> dict[str, Any]:
+    """Drive the out-and-back recording through odometry and place recognition."""
+    from bags.nodes.lockstep import LockStep
+    from lcd_common.nodes import messages
+    from lcd_common.nodes.parameters import overrides
+    from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
+    from lcd_loop_closure.nodes.offline_slam import own_context
+    from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
+
+    drive = open_drive(karlsruhe_out_and_back(work))
+    truth = drive.truth()
+    assert truth is not None
+    heard: list[Any] = []
+    with own_context() as context:
+        made: dict[str, Any] = {'context': context, 'use_global_arguments': False}
+        ranges = {'max_range': 80.0, 'min_range': 3.0}
+        chosen = {
+            'weights': os.environ.get('PLACE_ENSEMBLE', ''),
+            'calibration': os.environ.get('PLACE_CALIBRATION', ''),
+        }
+        nodes = (
+            LidarOdometryNode(
+                **made, parameter_overrides=overrides(threaded=False, threads=1, **ranges)
+            ),
+            PlaceRecognitionNode(**made, parameter_overrides=overrides(threaded=False, **chosen)),
+        )
+        lockstep = LockStep(nodes)
+        lockstep.listen('/place_matches', heard.append)
+        try:
+            lockstep.run(drive, progress=True)
+            stamp_of = {place.id: place.stamp_ns for place in nodes[1].recognizer.places()}
+        finally:
+            for node in nodes:
+                node.destroy_node()
+    asked = [message for message in heard if message.matches]
+    stamps = [messages.stamp_ns(message.header.stamp) for message in asked]
+    here = np.array([_position(truth, stamp) for stamp in stamps])
+    found = [stamp_of[message.matches[0].place_id] for message in asked]
+    there = np.array([_position(truth, stamp) for stamp in found])
+    # A place is known where the vehicle was before, except for the last ones (they wait).
+    order = sorted(stamp_of.values())
+    known = np.array(
+        [_was_here(truth, order, stamp, where) for stamp, where in zip(stamps, here, strict=True)]
+    )
+    right = np.linalg.norm(here - there, axis=1) <= _SAME_PLACE_M
+    uncertainty = np.array([message.matches[0].uncertainty for message in asked])
+    accepted = np.array([message.matches[0].accepted for message in asked])
+    _draw(here, there, right, known, uncertainty, work / 'pictures' / 'out_and_back.png')
+    both = right.any() and not right.all()
+    return {
+        'answers': len(asked),
+        'revisits': int(known.sum()),
+        'recall_1_of_revisits': float(right[known].mean()) if known.any() else None,
+        'accepted': int(accepted.sum()),
+        'accepted_wrong': int((accepted & ~right).sum()),
+        'auroc_of_uncertainty': auroc(uncertainty, ~right) if both else None,
+    }
+
+
+def _position(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:
+    T_world_base = truth.at(stamp_ns)
+    assert T_world_base is not None
+    return T_world_base[:2, 3]
+
+
+def _was_here(truth: Trajectory, places: list[int], stamp: int, where: NDArray[np.float64]) -> bool:
+    before = [one for one in places if one < stamp][:-15]
+    at = np.array([_position(truth, one) for one in before]).reshape(-1, 2)
+    return bool((np.linalg.norm(at - where, axis=1) <= _SAME_PLACE_M).any())
+
+
+def _draw(
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    known: NDArray[np.bool_],
+    uncertainty: NDArray[np.float64],
+    path: Path,
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with figure(path, (13.0, 5.0)) as canvas:
+        left, middle = canvas.subplots(1, 2)
+        for k in np.flatnonzero(known | right):
+            colour = '#009E73' if right[k] else '#D55E00'
+            left.plot(*np.c_[here[k], there[k]], color=colour, lw=0.8, alpha=0.6)
+        left.plot(here[:, 0], here[:, 1], color='#222222', lw=1.2)
+        left.set_aspect('equal', adjustable='datalim')
+        left.set_title('Matches: right (green) and wrong')
+        left.set_xlabel('x [m]')
+        left.set_ylabel('y [m]')
+        shown = middle.scatter(here[:, 0], here[:, 1], c=uncertainty, s=14, cmap='viridis')
+        middle.set_aspect('equal', adjustable='datalim')
+        middle.set_title('Uncertainty u along the drive')
+        middle.set_xlabel('x [m]')
+        canvas.colorbar(shown, ax=middle)
+
+
+def _uncertainties(
+    recognizer: PlaceRecognizer, sweeps: list[PointCloud], view: Callable[[PointCloud], PointCloud]
+) -> NDArray[np.float64]:
+    found = []
+    for cloud in sweeps:
+        try:
+            found.append(float(total_uncertainty(recognizer.embed(_in_base(view(cloud))))))
+        except DataError:
+            continue  # too little is left above the ground; counted by the caller
+    return np.array(found)
+
+
+def _sixteen_beams(cloud: PointCloud) -> PointCloud:
+    """Return what a sensor of 16 beams from -15 to 15 degrees would have of a sweep (LiDAR)."""
+    elevation = np.degrees(np.arctan2(cloud.xyz[:, 2], np.linalg.norm(cloud.xyz[:, :2], axis=1)))
+    off = np.abs((elevation + 15.0) / 2.0 - np.round((elevation + 15.0) / 2.0))
+    return cloud.select((np.abs(elevation) <= 15.5) & (off < 0.1))
+
+
+def _all_searchable(recognizer: PlaceRecognizer) -> PlaceRecognizer:
+    """Return a recognizer that answers with all places: as after saving and loading a map."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as temporary:
+        recognizer.load(recognizer.save(Path(temporary) / 'map'))
+    return recognizer
+
+
+def _in_base(cloud: PointCloud) -> PointCloud:
+    return cloud.transformed(_MOUNT)
