@@ -59,7 +59,7 @@ class Fed:
 
     def service(self, name: str, request: Any, response: Any) -> Any:
         """Call a service of the node."""
-        return getattr(self.node.services_offered, name)(request, response)
+        return getattr(self.node.place_services, name)(request, response)
 
     def save(self, path: Path) -> Any:
         """Save the places."""
@@ -267,6 +267,33 @@ def test_keyframes_give_places_their_numbers_and_the_graph_their_poses(
     made.lockstep.feed('/points', drive.scan(7))
     made.lockstep.feed('/keyframe', _numbered(drive.keyframe(7), 0))
     assert [p.id for p in made.node.recognizer.places()] == [0]
+
+
+def test_keyframes_of_another_map_neither_answer_nor_move_places(
+    fed: Callable[..., Fed], tmp_path: Path
+) -> None:
+    made = fed(follow='keyframes')
+    for step in range(4):
+        made.lockstep.feed('/points', drive.scan(step))
+        made.lockstep.feed('/keyframe', drive.keyframe(step))
+    assert made.save(tmp_path / 'map').success
+    later = fed(follow='keyframes', map=str(tmp_path / 'map'))
+    before = [place.T_map_base for place in later.node.recognizer.places()]
+    elsewhere = np.array([se3.rotation_z(2.0) @ drive.true_pose(s) for s in range(4)])
+    moved = positions_message(np.arange(4), elsewhere, 1, 'map')
+    later.lockstep.feed('/graph/keyframes', moved)
+    later.lockstep.feed('/points', drive.scan(10))
+    later.lockstep.feed('/keyframe', _numbered(drive.keyframe(10), 0))
+    later.lockstep.feed('/graph/keyframes', moved)
+    assert later.answers == []
+    assert later.counted('rejected keyframe: other session') == 1
+    assert 'load the map of the same drive' in later.node.diagnostics.status().message
+    for place, T_map_base in zip(later.node.recognizer.places(), before, strict=True):
+        np.testing.assert_array_equal(place.T_map_base, T_map_base)
+    later.lockstep.feed('/points', drive.scan(12))
+    later.lockstep.feed('/keyframe', _numbered(drive.keyframe(12), 4))
+    assert len(later.answers) == 1
+    assert later.node.diagnostics.status().level == DiagnosticStatus.WARN
 
 
 def _numbered(message: Any, id: int) -> Any:

@@ -37,6 +37,9 @@ class DrivePlaces:
         self._by_keyframes = by_keyframes
         loaded = recognizer.places()
         self._keyframes = KeyframePoses(loaded)
+        self.first_id = (
+            recognizer.next_id
+        )  # keyframes of a session in this map are numbered from it
         self._T_map_odom: se3.Array | None = None if loaded else np.eye(4)
         self._search = relocalizer
         self._relocalizer: Relocalizer | None = None

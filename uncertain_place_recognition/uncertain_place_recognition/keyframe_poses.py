@@ -45,7 +45,12 @@ class KeyframePoses:
         return self._search.pose(keyframe, keyframes, self._graph)
 
     def corrected(self, graph: GraphPositions) -> dict[int, se3.Array]:
-        """Take in the graph's positions; return T_map_base by id of the keyframes that moved."""
+        """Take in the graph's positions; return T_map_base by id of the keyframes that moved.
+
+        Before the first keyframe of this session nobody knows whether it is the graph of this map.
+        """
+        if not self._session:
+            return {}
         self._graph = graph
         self._note_located()
         moved = {}

@@ -166,7 +166,7 @@ class PlaceRecognitionNode(Node):
             self.create_subscription(
                 PointCloud2, 'graph/keyframes', self.on_graph_keyframes, qos.LATCHED
             )
-        self.services_offered = PlaceServices(self, threaded=self.config.threaded)
+        self.place_services = PlaceServices(self, threaded=self.config.threaded)
         self.diagnostics.watch('places', lambda: len(self.recognizer))
         self.diagnostics.watch('places that can be answered', lambda: self.recognizer.searchable)
         self.diagnostics.watch('scans waiting', self._scans.waiting)
@@ -210,6 +210,16 @@ class PlaceRecognitionNode(Node):
             self.get_logger().warning('loop_closure started a new session: so do the places')
             self.diagnostics.count('sessions restarted')
             self.restart(self.map_path)
+        problem = None
+        if keyframe.id < self.drive.first_id:
+            problem = (
+                f'places up to {self.drive.first_id - 1} are loaded, but keyframes are numbered '
+                f'from {keyframe.id}: load the map of the same drive in loop_closure, too'
+            )
+            self._reject('keyframe', 'other session', problem)
+        self.diagnostics.error('session', problem)
+        if problem is not None:
+            return
         lost = self._keyframes.lost
         self._take_keyframe(self._keyframes.add_keyframe(keyframe))
         for _ in range(self._keyframes.lost - lost):
@@ -324,11 +334,7 @@ class PlaceRecognitionNode(Node):
         waits = drive.looking and 'looking for the vehicle in the loaded map'
         self.diagnostics.warn('relocalize', waits or None)
         if self.config.grow or drive.force_next:
-            try:
-                added = drive.add(members, cloud, scan.pose, scan.keyframe_id)
-            except DataError as error:
-                self._reject('places', 'number taken', f'{error}: load the map in loop_closure too')
-                return
+            added = drive.add(members, cloud, scan.pose, scan.keyframe_id)
             self.diagnostics.count('places added' if added else 'places not added: not located')
 
     def _cloud(self, scan: _Scan) -> PointCloud | None:
