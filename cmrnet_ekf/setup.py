@@ -38,6 +38,7 @@ setup(
     entry_points={
         'console_scripts': [
             'ekf = cmrnet_ekf.nodes.ekf_node:main',
+            'map_registration = cmrnet_ekf.nodes.map_registration_node:main',
             'build_lidar_map = cmrnet_ekf.mapping.build:main',
             'make_cmrnet_samples = cmrnet_ekf.training.make:main',
             'train_cmrnet = cmrnet_ekf.training.train:main',

@@ -17,11 +17,13 @@ from typing import Any
 
 from cmrnet_ekf.ekf.ekf_settings import EkfSettings
 from cmrnet_ekf.ekf.gnss_start import GnssStartConfig
+from cmrnet_ekf.mapping.local_map import LocalMapConfig
 from cmrnet_ekf.nodes.ekf_health import EkfHealthConfig
 from cmrnet_ekf.nodes.ekf_inputs import FixInputConfig, OdometryInputConfig, PoseInputConfig
 from cmrnet_ekf.nodes.ekf_node import EkfNodeConfig
 from cmrnet_ekf.nodes.ekf_sources import EkfInputsConfig
 from cmrnet_ekf.nodes.gnss_datum import GnssDatumConfig
+from cmrnet_ekf.nodes.map_registration_node import MapRegistrationConfig
 from lcd_common.settings import describe
 from lcd_loop_closure.graph_settings import GraphSettings
 from lcd_loop_closure.imu_preintegration import ImuConfig
@@ -72,6 +74,7 @@ def _nodes() -> dict[str, dict[str, _Parts]]:
                     'health': EkfHealthConfig,
                 },
             ),
+            'map_registration': ((MapRegistrationConfig,), {'local_map': LocalMapConfig}),
         },
         'lcd_loop_closure': {
             'lidar_odometry': ((LidarOdometryNodeConfig, OdometryConfig), {}),

@@ -97,6 +97,13 @@ class CameraLocalizer:
             float((lidar > 0).float().mean()),
         )
 
+    def view(
+        self, points: NDArray[np.float32] | torch.Tensor, T_map_base: se3.Array
+    ) -> torch.Tensor:
+        """Return the LiDAR image [H x W], metres, as the last stage sees it from a pose."""
+        T_map_body = T_map_base @ self._T_base_body
+        return self._imagers[-1].image(points, T_OPTICAL_BODY @ se3.inverse(T_map_body))
+
 
 def base_covariance(belief: PoseBelief, T_body_base: se3.Array) -> se3.Array:
     """Return the covariance of T_map_base, body axes of base, of a belief of one pose."""
