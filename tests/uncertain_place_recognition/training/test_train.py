@@ -53,6 +53,16 @@ def test_an_ensemble_is_trained_packed_and_goes_on(runs, tmp_path, capsys):
     assert capsys.readouterr().out.count('trained already') == 3
 
 
+def test_time_runs_out_and_the_same_command_goes_on(runs, tmp_path, capsys):
+    command = ['ensemble', *runs, *_SMALL, *_SHORT, '--members', '1', '--out', str(tmp_path)]
+    assert main([*command, '--minutes', '0']) == 0
+    told = capsys.readouterr().out
+    assert 'no time for a step' in told and 'no student begins' in told
+    assert not (tmp_path / 'student_1').exists()
+    assert main(command) == 0
+    assert '1 members' in capsys.readouterr().out
+
+
 def test_the_other_roles(runs, tmp_path):
     common = [*runs, *_SHORT]
     teacher = tmp_path / 'teacher'

@@ -100,7 +100,7 @@ def test_a_student_with_a_head_learns_a_variance(tmp_path):
     student = _network(2, replace(SHAPE, variance=True))
     trainer = _trainer(tmp_path, student, teacher=teacher, steps=30, learning_rate=0.01)
     records = list(trainer.run())
-    assert np.mean([r.loss for r in records[-5:]]) < np.mean([r.loss for r in records[:5]]) - 0.1
+    assert np.mean([r.loss for r in records[-5:]]) < np.mean([r.loss for r in records[:5]]) - 0.8
 
 
 def test_students_see_every_submap_once_in_an_epoch_in_an_order_of_their_own(tmp_path, monkeypatch):

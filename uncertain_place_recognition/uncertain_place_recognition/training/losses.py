@@ -140,13 +140,16 @@ def contrastive(
 
 
 def distillation(student: Tensor, teacher: Tensor) -> Tensor:
-    """Return the smooth L1 distance of embeddings [B x D] to the teacher's (thesis equation 21)."""
-    return functional.smooth_l1_loss(student, teacher)
+    """Return the smooth L1 distance of embeddings [B x D] to the teacher's (thesis equation 21).
+
+    Summed over the features: their mean is so small that weight decay would outweigh it.
+    """
+    return functional.smooth_l1_loss(student, teacher, reduction='none').sum(1).mean()
 
 
 def gaussian_likelihood(mean: Tensor, variance: Tensor, teacher: Tensor) -> Tensor:
-    """Return STUN's loss (mu_t - mu)^2 / (2 var) + log(var) / 2, the mean over all numbers."""
-    return ((teacher - mean) ** 2 / (2.0 * variance) + 0.5 * variance.log()).mean()
+    """Return STUN's loss, the sum over features of (mu_t - mu)^2 / (2 var) + log(var) / 2."""
+    return ((teacher - mean) ** 2 / (2.0 * variance) + 0.5 * variance.log()).sum(1).mean()
 
 
 def distances(embeddings: Tensor) -> Tensor:

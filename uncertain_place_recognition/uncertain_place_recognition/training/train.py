@@ -63,8 +63,8 @@ def _run(arguments: argparse.Namespace) -> None:
         _metric(arguments.role, data, arguments.out, arguments)
 
 
-def _metric(role: str, data: _Data, out: Path, arguments: argparse.Namespace) -> None:
-    """Train a network by the distance of places."""
+def _metric(role: str, data: _Data, out: Path, arguments: argparse.Namespace) -> bool:
+    """Train a network by the distance of places; tell whether it is done."""
     changes = {'dropout': arguments.rate} if role == 'dropout' else {}
     settings = shape(arguments.network, arguments.preset, **changes)
     settings = _changed(settings, arguments.set)
@@ -72,7 +72,7 @@ def _metric(role: str, data: _Data, out: Path, arguments: argparse.Namespace) ->
     training = TrainingConfig(learning_rate=rate, seed=arguments.seed)
     training = _changed(training, arguments.train)
     torch.manual_seed(training.seed)
-    _train(role, build(settings), training, None, data, out, arguments)
+    return _train(role, build(settings), training, None, data, out, arguments)
 
 
 def _student(
@@ -83,7 +83,7 @@ def _student(
     out: Path,
     seed: int,
     arguments: argparse.Namespace,
-) -> None:
+) -> bool:
     """Train a network towards a teacher's embeddings, half as long as the teacher was trained."""
     settings = replace(teacher.settings, variance=role == 'stun', dropout=0.0)
     theirs = facts['training']
@@ -97,7 +97,7 @@ def _student(
     network = build(settings)
     if role == 'stun':
         network.load_state_dict(teacher.state_dict(), strict=False)
-    _train(role, network, training, teacher, data, out, arguments)
+    return _train(role, network, training, teacher, data, out, arguments)
 
 
 def _train(
@@ -108,7 +108,7 @@ def _train(
     data: _Data,
     out: Path,
     arguments: argparse.Namespace,
-) -> None:
+) -> bool:
     device = choose_device(arguments.device)
     augmentation = _changed(AugmentationConfig(), arguments.augment)
     pairs = _changed(PairConfig(), arguments.pairs)
@@ -132,6 +132,7 @@ def _train(
     judge = Judge(out, data.validation, facts, teacher, device)
     deadline = None if arguments.minutes is None else time.monotonic() + 60.0 * arguments.minutes
     every = arguments.validate_every or max(1, training.steps // 8)
+    begin = trainer.step
     shown: Judgement | None = None
     with tqdm(total=training.steps, initial=trainer.step, unit='step', desc=out.name,
               disable=arguments.quiet) as bar:  # fmt: skip
@@ -140,25 +141,34 @@ def _train(
             if record.step % every == 0 or record.step == training.steps:
                 shown = judge.judge(trainer.network, record.step)
             bar.set_postfix_str(_postfix(record.loss, record.active, shown), refresh=False)
-    if shown is None and trainer.step < training.steps:
-        shown = judge.judge(trainer.network, trainer.step)
+    if trainer.step > begin and (shown is None or shown.step < trainer.step):
+        shown = judge.judge(trainer.network, trainer.step)  # time was up between two judgements
     if shown is not None:
         sys.stdout.write(f'{out}: step {trainer.step} of {training.steps}, {_told(shown)}\n')
     else:
-        sys.stdout.write(f'{out}: trained already, {training.steps} steps\n')
+        state = 'trained already' if trainer.step == training.steps else 'no time for a step'
+        sys.stdout.write(f'{out}: {state}, step {trainer.step} of {training.steps}\n')
+    return trainer.step == training.steps
 
 
 def _ensemble(data: _Data, arguments: argparse.Namespace) -> None:
     """Train a teacher and its students, each in a folder of its own, and pack the students."""
     out: Path = arguments.out
-    _metric('teacher', data, out / 'teacher', arguments)
+    if not _metric('teacher', data, out / 'teacher', arguments):
+        sys.stdout.write('the teacher is not done, so no student begins; run the command again\n')
+        return
     given = list(arguments.train)
     arguments.train = [change for change in given if change.partition('=')[0] != 'steps']
     arguments.train += arguments.train_students
     teacher, facts = _teacher(out / 'teacher')
     folders = [out / f'student_{number}' for number in range(1, arguments.members + 1)]
-    for number, folder in enumerate(folders, 1):
+    done = [
         _student('student', teacher, facts, data, folder, arguments.seed + number, arguments)
+        for number, folder in enumerate(folders, 1)
+    ]
+    if not all(done):
+        sys.stdout.write('not all students are done, so none is packed; run the command again\n')
+        return
     arguments.validation_runs = data.validation
     _pack(folders, out / PACKED, arguments)
 
