@@ -8,24 +8,30 @@ from numpy.typing import NDArray
 DRAWS = 1000
 
 
-def drawn_pairs(
+def pair_weights(
     pairs: Sequence[tuple[int, int]], draws: int = DRAWS, seed: int = 0
-) -> Iterator[NDArray[np.int64]]:
-    """Yield numbers [P] of pairs, each as often as its two runs were drawn together.
+) -> NDArray[np.int64]:
+    """Return how often [draws x P] each pair comes: as often as its two runs, drawn together.
 
-    Nothing comes of fewer than three runs: they are too few to say.
+    There are no rows with fewer than three runs: they are too few to say.
     """
     table = np.asarray(pairs, np.int64).reshape(-1, 2)
     runs, numbers = np.unique(table, return_inverse=True)
     if len(runs) < 3:
-        return
+        return np.empty((0, len(table)), np.int64)
     numbers = numbers.reshape(-1, 2)
-    rng = np.random.default_rng(seed)
-    for _ in range(draws):
-        drawn = rng.multinomial(len(runs), np.full(len(runs), 1.0 / len(runs)))
-        chosen = np.repeat(np.arange(len(numbers)), drawn[numbers].prod(axis=1))
-        if len(chosen):
-            yield chosen
+    share = np.full(len(runs), 1.0 / len(runs))
+    drawn = np.random.default_rng(seed).multinomial(len(runs), share, size=draws)
+    weights: NDArray[np.int64] = drawn[:, numbers[:, 0]] * drawn[:, numbers[:, 1]]
+    return weights[weights.any(axis=1)]
+
+
+def drawn_pairs(
+    pairs: Sequence[tuple[int, int]], draws: int = DRAWS, seed: int = 0
+) -> Iterator[NDArray[np.int64]]:
+    """Yield numbers of pairs, each as often as `pair_weights` says."""
+    for weights in pair_weights(pairs, draws, seed):
+        yield np.repeat(np.arange(len(weights)), weights)
 
 
 def interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float] | None:
@@ -42,12 +48,6 @@ def mean_interval(
     pairs: Sequence[tuple[int, int]], values: NDArray[np.float64], draws: int = DRAWS
 ) -> tuple[float, float] | None:
     """Return the 95 % interval of the mean of a value [P] of each pair; NaN values do not count."""
-    counts = np.isfinite(values)
-    clean = np.where(counts, values, 0.0)
-    return interval(
-        [
-            clean[chosen].sum() / counts[chosen].sum()
-            for chosen in drawn_pairs(pairs, draws)
-            if counts[chosen].any()
-        ]
-    )
+    weights = pair_weights(pairs, draws) * np.isfinite(values)
+    weights = weights[weights.any(axis=1)]
+    return interval((weights @ np.nan_to_num(values) / weights.sum(axis=1)).tolist())

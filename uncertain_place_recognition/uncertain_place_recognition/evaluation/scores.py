@@ -1,6 +1,6 @@
 """Compare doubts as detectors of wrong matches, with intervals over runs and removal curves."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -40,7 +40,7 @@ SCORES = {
 }
 REMOVED = np.linspace(0.0, 0.9, 19)
 DRAWS = 200
-_WITH_INTERVAL = {
+_WITH_INTERVAL: dict[str, Callable[[NDArray[np.float64], NDArray[np.bool_]], float]] = {
     'auroc': auroc,
     'aurc': aurc,
     'fpr95': false_positive_rate,
