@@ -69,7 +69,7 @@ class Framing:
             pixels = np.repeat(pixels[:, :, None], 3, axis=2)
         width, height = self._size
         if (height, width) != expected:
-            planes = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None].float()
+            planes = torch.from_numpy(np.array(pixels)).permute(2, 0, 1)[None].float()
             smaller = torch.nn.functional.interpolate(
                 planes, (height, width), mode='bilinear', antialias=True, align_corners=False
             )
