@@ -24,8 +24,7 @@ def replay(
     drive: KittiRecording, outages: Outages | None, **parameters: object
 ) -> tuple[Track, dict[str, int]]:
     """Return where the node says that the vehicle is, ten times a second, and its counters."""
-    began = not rclpy.ok()
-    if began:
+    if not rclpy.ok():
         rclpy.init()
     node = EkfNode(
         namespace='/kitti',
@@ -45,8 +44,6 @@ def replay(
         return _through(node, drive, outages)
     finally:
         node.destroy_node()
-        if began:
-            rclpy.try_shutdown()
 
 
 def _through(

@@ -50,6 +50,8 @@ class EkfHealth:
     def add(self, name: str, timeout_s: float, *, absolute: bool = False) -> None:
         """Watch an input."""
         self._inputs[name] = _Input(timeout_s, absolute)
+        if name == 'imu':  # it moves the estimate and is not judged by it
+            return
         self._diagnostics.watch(f'{name} rejected in a row', lambda: self._inputs[name].rejected)
         self._diagnostics.watch(f'{name} NIS', lambda: f'{self._inputs[name].nis:.2f}')
 

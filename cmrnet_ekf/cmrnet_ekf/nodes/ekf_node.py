@@ -1,7 +1,7 @@
 """Fuse an IMU with poses, odometry, twists and satellite fixes: where the vehicle is, how surely.
 
     ros2 run cmrnet_ekf ekf --ros-args --params-file config/ekf.yaml
-    ros2 run cmrnet_ekf ekf --ros-args -p "poses:=" -p "odometry:=" -p start_from:=gnss
+    ros2 run cmrnet_ekf ekf --ros-args -p "poses:=''" -p "odometry:=''" -p start_from:=gnss
 
 Subscribes  imu (sensor_msgs/Imu), /tf_static (where the sensors sit), initialpose
             (geometry_msgs/PoseWithCovarianceStamped: where the vehicle is, as ~/set_pose), and the

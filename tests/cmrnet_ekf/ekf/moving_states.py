@@ -66,7 +66,7 @@ def drive(seconds: float, rate_hz: float = 100.0, gravity: float = 9.81) -> Driv
     R, p, v = np.eye(3), np.zeros(3), np.array([8.0, 0.0, 0.0])
     g = np.array([0.0, 0.0, -gravity])
     forces, poses, velocities = [], [], []
-    fine = 20
+    fine = 5
     for k in range(n + 1):
         poses.append(se3.from_rotation_translation(R, p))
         velocities.append(v)

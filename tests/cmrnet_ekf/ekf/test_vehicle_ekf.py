@@ -364,3 +364,44 @@ def test_a_second_start_keeps_what_is_known_of_the_sensor() -> None:
     np.testing.assert_allclose(again.T_map_body[:3, 3], 0.0)
     ekf.reset()
     assert not ekf.started and ekf.estimate() is None
+
+
+def test_a_minority_does_not_win_over_an_accepted_pose() -> None:
+    """Fixes that agree with each other, wrongly (a reflection), while the camera is accepted."""
+    ekf = started()
+    shift = np.array([8.0, 0.0, 0.0])
+    for k in range(1, 1001):
+        feed(ekf, k - 1, k)
+        if k % 10 == 0:
+            assert ekf.observe(camera(k)).accepted
+        if k % 20 == 0 and k > 100:
+            position = TRUTH.T_map_body[k][:3, 3] + shift
+            seen = PositionObservation(int(TRUTH.stamps_ns[k]), 'gps', position, 0.25 * np.eye(3))
+            assert not ekf.observe(seen).accepted
+    assert off_truth(ekf, 1000) < 0.1
+
+
+def test_a_slow_input_alone_recovers_in_time() -> None:
+    """One fix a second: three that agree, and seconds since the last accepted one, are enough."""
+    ekf = started()
+    shift = np.array([30.0, 0.0, 0.0])
+    accepted = []
+    for k in range(1, 1101):
+        feed(ekf, k - 1, k)
+        if k % 100 == 0:
+            position = TRUTH.T_map_body[k][:3, 3] + (shift if k > 200 else 0.0)
+            seen = PositionObservation(int(TRUTH.stamps_ns[k]), 'gps', position, 0.25 * np.eye(3))
+            accepted.append(ekf.observe(seen).accepted)
+    assert accepted[:2] == [True, True] and accepted[2] is False
+    assert accepted[6:] == [True] * 5
+
+
+def test_a_full_pose_pulls_it_back_from_anywhere_in_one_step() -> None:
+    """A pose that is told with certainty: however far off, the step is exact."""
+    ekf = VehicleEkf(EkfSettings(gate=GateConfig(probability=1.0)))
+    ekf.start(0, se3.exp([60.0, -40.0, 5.0, 0.1, 0.2, 2.0]), np.diag([1e4] * 3 + [10.0] * 3))
+    ekf.observe(PoseObservation(0, 'camera', TRUTH.T_map_body[0], 1e-6 * np.eye(6)))
+    estimate = ekf.estimate()
+    assert estimate is not None
+    metres, radians = se3.distance(estimate.T_map_body, TRUTH.T_map_body[0])
+    assert metres < 1e-4 and radians < 1e-5
