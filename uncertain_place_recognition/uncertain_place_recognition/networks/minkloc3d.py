@@ -47,7 +47,16 @@ class MinkLoc3dConfig:
 
 
 ORIGINAL = MinkLoc3dConfig()
-COMPACT = MinkLoc3dConfig(voxel=0.02, first_kernel=3, planes=(16, 32, 32), size=128)
+# Where drives come back the other way, the polar grid learns more from few batches: there a turn
+# is a shift, which neither convolution nor pooling minds.
+COMPACT = MinkLoc3dConfig(
+    coordinates='polar',
+    voxel=0.03,
+    azimuths=128,
+    first_kernel=3,
+    planes=(16, 32, 32),
+    size=128,
+)
 
 
 class MinkLoc3d(PlaceNetwork):
