@@ -60,6 +60,11 @@ class EkfHealth:
         self._inputs[name].came_ns = self._now_ns()
         self._diagnostics.tick(name, stamp_ns)
 
+    def is_silent(self, name: str) -> bool:
+        """Tell whether an input has not come for longer than its timeout, or never."""
+        seen = self._inputs[name]
+        return seen.came_ns is None or self._seconds_since(seen.came_ns) > seen.timeout_s
+
     def judged(self, verdict: Verdict) -> None:
         """Note what became of an observation."""
         if verdict.dof == 0:

@@ -300,6 +300,16 @@ class EkfNode(Node):
         self.diagnostics.count(f'rejected {what}: {cause}')
         self.get_logger().warning(text, throttle_duration_sec=5.0)
 
+    def is_ahead(self, stamp_ns: int) -> bool:
+        """Tell whether a stamp is further ahead of a living IMU than input may be late.
+
+        The estimate would run ahead with it, and the samples would come too late.
+        """
+        newest_ns = self._guard.newest_ns
+        if not self.config.use_imu or newest_ns is None or self.health.is_silent('imu'):
+            return False
+        return stamp_ns - newest_ns > self._history_ns()
+
     def jumped_back(self, stamp_ns: int) -> None:
         """Act on a clock that jumped back, seen by an input where there is no imu."""
         self._jump(stamp_ns)

@@ -267,6 +267,10 @@ class EkfSources:
             return
         stamp_ns = messages.stamp_ns(message.header.stamp)
         node.health.came(name, stamp_ns)
+        if node.is_ahead(stamp_ns):
+            text = f'{name} is stamped far ahead of imu: are the clocks the same?'
+            node.reject(name, 'ahead of imu', text)
+            return
         jumped = self._guards[name].check(stamp_ns) is StampVerdict.JUMPED_BACK
         if jumped and not node.config.use_imu:
             node.jumped_back(stamp_ns)
