@@ -116,6 +116,17 @@ def test_students_see_every_submap_once_in_an_epoch_in_an_order_of_their_own(tmp
     assert seen[1] != seen[2]
 
 
+def test_a_mirrored_submap_is_not_taken_for_the_plain_one(tmp_path):
+    teacher, flipping = _network().eval(), AugmentationConfig(flip=0.5)
+    for sees, flip in (('plain', 0.0), ('changed', 0.5)):
+        settings = TrainingConfig(teacher_sees=sees)
+        trainer = Trainer(
+            _network(), RUNS, tmp_path, settings, teacher=teacher, augmentation=flipping,
+            pairs=PAIRS,
+        )  # fmt: skip
+        assert trainer.augmentation.flip == flip
+
+
 def test_a_collapse_is_an_alarm(tmp_path):
     network = _network()
     trainer = _trainer(tmp_path, network, collapse=10.0, collapse_after=3, steps=50)

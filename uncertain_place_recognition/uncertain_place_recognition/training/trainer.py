@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +55,10 @@ class TrainingConfig:
     )
     margin: float = setting(0.2, 'of the triplet loss', low=0.0)
     teacher_sees: str = setting(
-        'plain',
-        'a student learns the embedding of the submap as it is, or of the changed one that it sees',
-        choices=('plain', 'changed'),
+        'changed',
+        'a student learns the embedding of the changed submap that it sees, as in equation 21, or '
+        'of the submap as it is, computed once',
+        choices=('changed', 'plain'),
     )
     clip: float = setting(5.0, 'largest norm of the gradient; 0: any', low=0.0)
     checkpoint_every: int = setting(200, 'batches between checkpoints', low=1)
@@ -92,6 +93,7 @@ class Trainer:
 
     Attributes:
         network: being trained.
+        augmentation: of its submaps.
         step: batches done.
     """
 
@@ -124,7 +126,7 @@ class Trainer:
                 network or training.
         """
         self.settings, self.folder, self._runs = settings, folder, runs
-        self._augmentation = augmentation or AugmentationConfig()
+        self.augmentation = augmentation or AugmentationConfig()
         self.device = torch.device(device)
         self.network = network.to(self.device)
         self._pairs = PlacePairs(runs, pairs)
@@ -136,6 +138,8 @@ class Trainer:
             )
         self._targets: Tensor | None = None
         if self._teacher is not None and settings.teacher_sees == 'plain':
+            # The mirror image of a place is another place.
+            self.augmentation = replace(self.augmentation, flip=0.0)
             found = np.concatenate(embed_runs(self._teacher, runs, self.device))
             self._targets = torch.from_numpy(found).to(self.device)
         self.optimizer = torch.optim.Adam(
@@ -214,7 +218,7 @@ class Trainer:
         torch.manual_seed(int(rng.integers(1 << 62)))  # dropout
         chosen = self._chosen(rng)
         plain = points_of(self._points(chosen), self.device)
-        points = augmented(plain, self._augmentation, generator)
+        points = augmented(plain, self.augmentation, generator)
         for group in self.optimizer.param_groups:
             group['lr'] = self._learning_rate()
         self.network.train()
