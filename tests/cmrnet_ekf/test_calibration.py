@@ -5,13 +5,11 @@ import pytest
 from scipy import stats
 
 from cmrnet_ekf.calibration import (
-    accepted,
     ause,
     calibration,
     calibration_curve,
     sharpness,
     sparsification,
-    traces,
 )
 from cmrnet_ekf.pose_belief import PoseBelief
 from lcd_common.errors import DataError
@@ -101,19 +99,3 @@ def test_ause_is_nothing_for_a_perfect_order_and_large_for_the_reverse():
     known = np.trapezoid(-x * np.log(x) / (1 - x), x)
     assert useless == pytest.approx(known, abs=0.02)
     assert ause(errors, -errors) > useless
-
-
-def test_a_prediction_is_kept_when_both_traces_are_low():
-    rng = np.random.default_rng(7)
-    scale = np.ones((1000, 6))
-    scale[:, :3] *= rng.uniform(0.1, 1, (1000, 1))
-    scale[:, 3:] *= rng.uniform(0.1, 1, (1000, 1))
-    found = traces(belief(scale))
-    np.testing.assert_allclose(found, 3 * np.square(scale[:, [0, 3]]))
-    keep = accepted(found, 0.15)
-    # Independent traces: 15 % and 15 % of the rest go.
-    assert 1 - keep.mean() == pytest.approx(1 - 0.85**2, abs=0.02)
-    expected = (found <= np.quantile(found, 0.85, axis=0, method='higher')).all(1)
-    assert (keep == expected).mean() > 0.995
-    same = np.stack([found[:, 0], found[:, 0]], 1)
-    assert 1 - accepted(same, 0.15).mean() == pytest.approx(0.15, abs=0.001)

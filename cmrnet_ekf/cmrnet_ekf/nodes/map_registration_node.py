@@ -26,7 +26,6 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
-from cmrnet_ekf.calibration import traces
 from cmrnet_ekf.camera_localizer import CameraLocalizer, PoseEstimate
 from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig, near_origin
 from cmrnet_ekf.nodes.camera_messages import (
@@ -36,6 +35,7 @@ from cmrnet_ekf.nodes.camera_messages import (
 )
 from cmrnet_ekf.overlay import overlay
 from cmrnet_ekf.predictors import Predictor
+from cmrnet_ekf.rejection import traces
 from lcd_common import se3
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.nodes import messages, qos

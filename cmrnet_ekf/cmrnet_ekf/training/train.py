@@ -30,7 +30,7 @@ _EXAMPLES = """
 examples:
   make_cmrnet_samples towns:0-9 --out samples                first, once: simulated towns
   make_cmrnet_samples towns:100-101 --out judged
-  train_cmrnet --samples samples/* --validation judged/* --out runs/der --variant der
+  train_cmrnet --samples samples/town_* --validation judged/town_* --out runs/der --variant der
   train_cmrnet ... --out runs/member3 --variant plain --seed 3     a member of an ensemble
   train_cmrnet ... --out runs/der --variant der --minutes 60       an hour; the same again goes on
   train_cmrnet ... --out runs/full --network full --variant mcd --device cuda
