@@ -152,7 +152,7 @@ def test_what_a_judge_says_is_published(fed: Callable[..., Fed]) -> None:
 
 
 def test_broken_input_is_counted_and_survived(fed: Callable[..., Fed]) -> None:
-    made = fed()
+    made = fed(waiting_clouds=10)
     made.step(0)
     broken = drive.odom_message(1)
     broken.pose.pose.position.x = float('nan')

@@ -92,7 +92,7 @@ class PlaceRecognitionNodeConfig:
     max_odometry_gap: float = setting(
         0.3, 'longest time between two odometry messages to interpolate over', unit='s', low=0.0
     )
-    waiting_clouds: int = setting(10, 'clouds that may wait for odometry or keyframe', low=1)
+    waiting_clouds: int = setting(20, 'clouds that may wait for odometry or keyframe', low=1)
     waiting_scans: int = setting(5, 'chosen scans that may wait for their answer', low=1)
     on_time_jump: str = setting(
         'restart', 'what to do when the clock jumps back', choices=('restart', 'refuse')
