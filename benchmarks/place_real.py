@@ -201,21 +201,25 @@ def _draw(
     path: Path,
 ) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(here, axis=0), axis=1))]
+    # There and back on one road: a place is where it lies along the road.
+    along = np.linalg.svd(here - here.mean(0), full_matrices=False)[2][0]
+    colours = np.where(right, '#009E73', np.where(known, '#D55E00', '#BBBBBB'))
     with figure(path, (13.0, 5.0)) as canvas:
-        left, middle = canvas.subplots(1, 2)
-        for k in np.flatnonzero(known | right):
-            colour = '#009E73' if right[k] else '#D55E00'
-            left.plot(*np.c_[here[k], there[k]], color=colour, lw=0.8, alpha=0.6)
-        left.plot(here[:, 0], here[:, 1], color='#222222', lw=1.2)
-        left.set_aspect('equal', adjustable='datalim')
-        left.set_title('Matches: right (green) and wrong')
-        left.set_xlabel('x [m]')
-        left.set_ylabel('y [m]')
-        shown = middle.scatter(here[:, 0], here[:, 1], c=uncertainty, s=14, cmap='viridis')
-        middle.set_aspect('equal', adjustable='datalim')
-        middle.set_title('Uncertainty u along the drive')
-        middle.set_xlabel('x [m]')
-        canvas.colorbar(shown, ax=middle)
+        places, doubts = canvas.subplots(1, 2)
+        places.plot(travelled, here @ along, color='#222222', lw=1.2, label='vehicle')
+        places.scatter(travelled, there @ along, c=colours, s=12, zorder=3)
+        places.set_title('Best match of every scan')
+        places.set_ylabel('position along the road [m]')
+        doubts.scatter(travelled, uncertainty, c=colours, s=12)
+        doubts.set_title('Uncertainty u')
+        for name, colour in (
+            ('right', '#009E73'), ('wrong', '#D55E00'), ('a place it does not know', '#BBBBBB'),
+        ):  # fmt: skip
+            places.scatter([], [], c=colour, s=12, label=name)
+        places.legend(fontsize=8)
+        for ax in (places, doubts):
+            ax.set_xlabel('travelled [m]')
 
 
 def _uncertainties(
