@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
@@ -28,11 +29,12 @@ from lcd_loop_closure.revisits import RevisitConfig
 class PlaceHeadConfig:
     """How the place head is trained on its own."""
 
-    steps: int = setting(800, 'batches', low=1)
+    steps: int = setting(600, 'batches', low=1)
     groups: int = setting(6, 'neighbourhoods of a batch', low=1)
     sweeps: int = setting(16, 'sweeps of a neighbourhood', low=2)
     around: float = setting(50.0, 'how far its sweeps lie from its middle', unit='m', low=4.0)
-    same: float = setting(3.0, 'sweeps up to this far apart show one place', unit='m', low=0.1)
+    keypoints: int = setting(512, 'drawn anew of each sweep in each batch', low=16)
+    same: float = setting(4.0, 'sweeps up to this far apart show one place', unit='m', low=0.1)
     different: float = setting(4.5, 'sweeps farther apart show different places', unit='m', low=0.1)
     returned: float = setting(
         50.0, 'way between two sweeps that show a return to a place', unit='m', low=0.0
@@ -53,11 +55,10 @@ def train_place_head(
     middles = Neighbourhoods(features, s)
     head.train()
     for step in range(s.steps):
-        chosen = middles.draw(np.random.default_rng([s.seed, step, 101]))
-        rows = torch.from_numpy(chosen)
-        descriptors = network.describe(
-            features.values[rows].to(device).float(), features.keypoints[rows].to(device).float()
-        )
+        rng = np.random.default_rng([s.seed, step, 101])
+        chosen = middles.draw(rng)
+        values, keypoints = _some_keypoints(features, chosen, s.keypoints, rng)
+        descriptors = network.describe(values.to(device), keypoints.to(device))
         same, different = middles.relations(chosen)
         loss, confused = separation_loss(
             descriptors,
@@ -72,6 +73,20 @@ def train_place_head(
         optimizer.step()
         yield step + 1, float(loss.detach()), confused
     head.eval()
+
+
+def _some_keypoints(
+    features: PlaceFeatures, rows: NDArray[np.intp], number: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return features [B x number x D] and positions of as many keypoints of each sweep."""
+    chosen = torch.from_numpy(rows)
+    total = features.values.shape[1]
+    order = torch.from_numpy(rng.random((len(rows), total)).argsort(1)[:, :number])[..., None]
+    picked = [
+        torch.gather(whole[chosen], 1, order.expand(-1, -1, whole.shape[2])).float()
+        for whole in (features.values, features.keypoints)
+    ]
+    return picked[0], picked[1]
 
 
 class Neighbourhoods:
