@@ -36,7 +36,7 @@ def draw_curves(folder: Path) -> None:
         shown = [(row['step'], row[name]) for row in judged if row.get(name) is not None]
         if shown:
             axes[2].plot(*zip(*shown, strict=True), '.-', label=label)
-    axes[2].set_ylim(0.0, 1.02)
+    axes[2].set_ylim(bottom=0.0)
     axes[2].set_title('validation')
     axes[2].legend(fontsize=8)
     for axis in axes:
