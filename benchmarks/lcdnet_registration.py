@@ -13,7 +13,8 @@ from lcd_loop_closure.evaluation.study import study_registration, terminal_bar
 from lcd_loop_closure.evaluation.sweep_views import SectorRemoved, Sweeps
 
 METHODS = (
-    'lcdnet', 'lcdnet_accepted', 'lcdnet_ransac', 'lcdnet_fast', 'lcdnet_icp', 'kiss_matcher',
+    'lcdnet', 'lcdnet_accepted', 'lcdnet_ransac', 'lcdnet_fast', 'lcdnet_icp', 'lcdnet_gnc',
+    'lcdnet_kiss_matcher', 'kiss_matcher',
     'kiss_matcher_gicp',
     'fpfh_ransac', 'fgr', 'small_gicp', 'icp_point_to_point', 'icp_point_to_plane',
     'scan_context_yaw', 'isc_yaw', 'lidar_iris_yaw',

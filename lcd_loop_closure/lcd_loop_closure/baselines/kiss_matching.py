@@ -56,9 +56,18 @@ class KissMatcher:
 
     def register(self, match: NDArray[np.float32], query: NDArray[np.float32]) -> se3.Array | None:
         """Return T_match_query; None where it finds no solution or too few matches agree."""
+        config = self._package.KISSMatcherConfig(self.settings.voxel_size)
+        matcher = self._package.KISSMatcher(config)
+        return self._answer(matcher, matcher.estimate(query, match))
+
+    def solve(self, query: NDArray[np.float32], match: NDArray[np.float32]) -> se3.Array | None:
+        """Return T_match_query of matched points [N x 3], most of which may be wrong."""
+        config = self._package.KISSMatcherConfig(self.settings.voxel_size)
+        matcher = self._package.KISSMatcher(config)
+        return self._answer(matcher, matcher.prune_and_solve(query, match))
+
+    def _answer(self, matcher: Any, solution: Any) -> se3.Array | None:
         s = self.settings
-        matcher = self._package.KISSMatcher(self._package.KISSMatcherConfig(s.voxel_size))
-        solution = matcher.estimate(query, match)
         if not solution.valid or matcher.get_num_final_inliers() < s.min_inliers:
             return None
         return se3.from_rotation_translation(

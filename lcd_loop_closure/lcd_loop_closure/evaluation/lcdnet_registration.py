@@ -2,10 +2,16 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_loop_closure.feature_registration import FeatureRegistration, FeatureRegistrationConfig
+from lcd_loop_closure.baselines.kiss_matching import KissMatcher
+from lcd_loop_closure.feature_registration import (
+    FeatureRegistration,
+    FeatureRegistrationConfig,
+    truncated_motion,
+)
 from lcd_loop_closure.lcdnet.network import Features
 from lcd_loop_closure.lcdnet_descriptor import LcdnetDescriptor
 from lcd_loop_closure.local_features import LocalFeatures
@@ -60,6 +66,53 @@ class LcdnetRansac:
         """Return T_match_query; None without enough matches that agree."""
         found = self._registration.register(query, match)
         return found[0].T_match_query if found else None
+
+
+class LcdnetGnc(LcdnetRansac):
+    """By graduated non-convexity on the matches of features (GNC-TLS), all of them at once."""
+
+    name = 'lcdnet_gnc'
+
+    def register(self, match: LocalFeatures, query: LocalFeatures) -> se3.Array | None:
+        """Return T_match_query; None without three matches that agree."""
+        p, q = matched_keypoints(self._registration, match, query)
+        bound_m = self._registration.settings.inlier_distance
+        if len(p) < 3:
+            return None
+        T = truncated_motion(p, q, bound_m)
+        near = np.linalg.norm(p @ T[:3, :3].T + T[:3, 3] - q, axis=1) < bound_m
+        return T if np.count_nonzero(near) >= 3 else None
+
+
+class LcdnetKissMatcher(LcdnetRansac):
+    """By KISS-Matcher's solver on the matches of features; it stands in for TEASER++."""
+
+    name = 'lcdnet_kiss_matcher'
+
+    def __init__(self, descriptor: LcdnetDescriptor) -> None:
+        """Find the package; raises MissingPackageError without it."""
+        super().__init__(descriptor)
+        self._solver = KissMatcher()
+
+    def register(self, match: LocalFeatures, query: LocalFeatures) -> se3.Array | None:
+        """Return T_match_query; None where the solver finds none."""
+        p, q = matched_keypoints(self._registration, match, query)
+        if len(p) < 3:
+            return None
+        return self._solver.solve(p.astype(np.float32), q.astype(np.float32))
+
+
+def matched_keypoints(
+    registration: FeatureRegistration, match: LocalFeatures, query: LocalFeatures
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return keypoints of the query [K x 3] and their partners in the match [K x 3], metres."""
+    rows, columns, _ = registration.matches(
+        query.values.astype(np.float32), match.values.astype(np.float32)
+    )
+    return (
+        np.asarray(query.keypoints, np.float64)[rows],
+        np.asarray(match.keypoints, np.float64)[columns],
+    )
 
 
 class NodeRegistration:

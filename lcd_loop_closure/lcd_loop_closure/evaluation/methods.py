@@ -27,6 +27,8 @@ REGISTRATIONS: dict[str, str] = {
     'lcdnet_ransac': 'LCDNet: features alone',
     'lcdnet_fast': 'LCDNet: transport head alone',
     'lcdnet_icp': 'LCDNet: features, then point-to-point ICP',
+    'lcdnet_gnc': 'LCDNet: features, solved by graduated non-convexity',
+    'lcdnet_kiss_matcher': "LCDNet: features, solved by KISS-Matcher's solver",
     'kiss_matcher': 'KISS-Matcher',
     'kiss_matcher_gicp': 'KISS-Matcher, then GICP',
     'fpfh_ransac': 'FPFH and RANSAC (Open3D)',
@@ -117,6 +119,8 @@ class Methods:
     def _lcdnet_registration(self, name: str) -> CloudRegistration:
         from lcd_loop_closure.evaluation.lcdnet_registration import (
             LcdnetFast,
+            LcdnetGnc,
+            LcdnetKissMatcher,
             LcdnetRansac,
             NodeRegistration,
         )
@@ -129,6 +133,10 @@ class Methods:
             return LcdnetFast(self.lcdnet)
         if name == 'lcdnet_ransac':
             return LcdnetRansac(self.lcdnet)
+        if name == 'lcdnet_gnc':
+            return LcdnetGnc(self.lcdnet)
+        if name == 'lcdnet_kiss_matcher':
+            return LcdnetKissMatcher(self.lcdnet)
         return NodeRegistration(self.lcdnet, accepted_only=name == 'lcdnet_accepted')
 
     def _weights_hash(self) -> str:

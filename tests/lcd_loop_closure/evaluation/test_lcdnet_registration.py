@@ -9,6 +9,8 @@ from lcd_common import se3
 from lcd_common.errors import ConfigError
 from lcd_loop_closure.evaluation.lcdnet_registration import (
     LcdnetFast,
+    LcdnetGnc,
+    LcdnetKissMatcher,
     LcdnetRansac,
     NodeRegistration,
 )
@@ -41,8 +43,10 @@ def pair() -> tuple[LocalFeatures, LocalFeatures]:
     )
 
 
-@pytest.mark.parametrize('kind', [LcdnetFast, LcdnetRansac])
+@pytest.mark.parametrize('kind', [LcdnetFast, LcdnetRansac, LcdnetGnc, LcdnetKissMatcher])
 def test_matched_keypoints_give_the_pose_of_the_query_in_the_match(descriptor, kind):
+    if kind is LcdnetKissMatcher:
+        pytest.importorskip('kiss_matcher', reason='kiss-matcher is not installed')
     match, query = pair()
     T = kind(descriptor).register(match, query)
     metres, radians = se3.distance(T_MATCH_QUERY, T)
