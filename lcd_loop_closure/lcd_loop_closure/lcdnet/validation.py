@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from lcd_common import se3
+from lcd_loop_closure.evaluation.pair_protocol import PairScores, protocol_2
 from lcd_loop_closure.feature_registration import FeatureRegistration
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import PlaceShard
@@ -91,7 +92,7 @@ def validate(
     return Validation(
         len(distance),
         float(np.mean(distance.argmin(1) == np.arange(len(distance)))),
-        _average_precision(distance),
+        protocol_2(_scores(distance)).average_precision,
         float(right[:, 1].mean()),
         float(right[:, 2].mean()),
         float(right[:, 0].mean()),
@@ -105,9 +106,8 @@ def _errors(T: NDArray[np.floating] | None, T_true: se3.Array) -> tuple[float, f
     return se3.distance(np.asarray(T, np.float64), T_true)
 
 
-def _average_precision(distance: NDArray[np.floating]) -> float:
-    """Return the area under precision and recall of [n x n] distances whose diagonal is right."""
-    order = np.argsort(distance.ravel(), kind='stable')
-    right = np.eye(len(distance), dtype=bool).ravel()[order]
-    precision = np.cumsum(right) / np.arange(1, len(right) + 1)
-    return float(precision[right].mean())
+def _scores(distance: NDArray[np.floating]) -> PairScores:
+    """Return [n x n] distances whose diagonal alone shows one place."""
+    right = np.eye(len(distance), dtype=bool)
+    values = distance.astype(np.float32)
+    return PairScores(values[right], np.zeros(len(distance), bool), (values[~right],))
