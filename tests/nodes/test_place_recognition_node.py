@@ -1,6 +1,5 @@
 """Feed place_recognition by hand and read what it publishes."""
 
-import asyncio
 import subprocess
 import sys
 import threading
@@ -14,72 +13,24 @@ import pytest
 pytest.importorskip('rclpy')
 import made_up_drive as drive
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from place_feed import SPACING, Fed, fed_by
 from std_srvs.srv import Trigger
 
-from bags.nodes.lockstep import LockStep
 from lcd_common import se3
 from lcd_common.errors import ConfigError, MapError
 from lcd_common.nodes import messages
-from lcd_loop_closure.nodes.positions_message import positions_message
 from lcd_msgs.msg import PlaceMatchArray
-from lcd_msgs.srv import LoadMap, SaveMap
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 from uncertain_place_recognition.place import Judgement
 from uncertain_place_recognition.relocalizer import Relocalized
 
 pytestmark = pytest.mark.ros
-SPACING = {'places__distance': 0.5, 'recognizer__delay': 0}
-
-
-class Fed:
-    """A node in lock-step, and what it published."""
-
-    def __init__(self, node: PlaceRecognitionNode, prefix: str = '/', transform: bool = True):
-        self.node, self.prefix = node, prefix
-        self.lockstep = LockStep([node])
-        self.answers: list[PlaceMatchArray] = []
-        self.poses: list[PoseWithCovarianceStamped] = []
-        self.markers: list[Any] = []
-        self.lockstep.listen(prefix + 'place_matches', lambda m: self.answers.append(m))
-        self.lockstep.listen(prefix + 'initialpose', lambda m: self.poses.append(m))
-        self.lockstep.listen(prefix + 'place_markers', lambda m: self.markers.append(m))
-        if transform:
-            self.lockstep.feed('/tf_static', drive.static_transform())
-
-    def step(self, step: int, seen: int | None = None, **options: Any) -> None:
-        """Feed the scan of a step (or what another step sees), then its odometry."""
-        scan = drive.scan(step if seen is None else seen, stamp_ns=drive.stamp(step), **options)
-        self.lockstep.feed(self.prefix + 'points', scan)
-        self.lockstep.feed(self.prefix + 'odom', drive.odom_message(step))
-
-    def counted(self, cause: str) -> int:
-        """Return a counter of the node."""
-        return self.node.diagnostics.counted(cause)
-
-    def service(self, name: str, request: Any, response: Any) -> Any:
-        """Call a service of the node."""
-        return getattr(self.node.place_services, name)(request, response)
-
-    def save(self, path: Path) -> Any:
-        """Save the places."""
-        call = self.service('on_save_map', SaveMap.Request(path=str(path)), SaveMap.Response())
-        return asyncio.run(call)
-
-    def load(self, path: Path | str) -> Any:
-        """Load places."""
-        return self.service('on_load_map', LoadMap.Request(path=str(path)), LoadMap.Response())
 
 
 @pytest.fixture
 def fed(make: Callable[..., Any], small_weights: Path) -> Callable[..., Fed]:
     """Make a fed node with small weights."""
-
-    def construct(transform: bool = True, **parameters: Any) -> Fed:
-        values = {'threaded': False, 'weights': str(small_weights), **SPACING, **parameters}
-        return Fed(make(PlaceRecognitionNode, **values), transform=transform)
-
-    return construct
+    return fed_by(make, small_weights)
 
 
 class Vouching:
@@ -241,73 +192,6 @@ def test_a_place_is_added_by_hand(fed: Callable[..., Fed]) -> None:
     assert place.stamp_ns == drive.stamp(2)
     assert made.service('on_reset', Trigger.Request(), Trigger.Response()).success
     assert len(made.node.recognizer) == 0
-
-
-def test_keyframes_give_places_their_numbers_and_the_graph_their_poses(
-    fed: Callable[..., Fed],
-) -> None:
-    made = fed(follow='keyframes')
-    for step in range(6):
-        made.lockstep.feed('/points', drive.scan(step))
-        made.lockstep.feed('/odom', drive.odom_message(step))
-        if step != 3:  # keyframes alone become places
-            made.lockstep.feed('/keyframe', drive.keyframe(step, first_id=10))
-    assert [p.id for p in made.node.recognizer.places()] == [10, 11, 12, 14, 15]
-    assert len(made.answers) == 5
-    moved = np.array([se3.rotation_z(0.3) @ drive.true_pose(s) for s in range(6)])
-    moved[:, :3, 3] += [5.0, -2.0, 0.0]
-    made.lockstep.feed('/graph/keyframes', positions_message(np.arange(10, 16), moved, 1, 'map'))
-    for step in (0, 1, 2, 4, 5):
-        np.testing.assert_allclose(
-            made.node.recognizer.place(10 + step).T_map_base, moved[step], atol=1e-4
-        )
-    made.lockstep.feed('/graph/keyframes', drive.scan(0))
-    assert made.counted('rejected graph/keyframes: broken') == 1
-    # loop_closure starts again
-    made.lockstep.feed('/points', drive.scan(7))
-    made.lockstep.feed('/keyframe', _numbered(drive.keyframe(7), 0))
-    assert [p.id for p in made.node.recognizer.places()] == [0]
-
-
-def test_keyframes_of_another_map_neither_answer_nor_move_places(
-    fed: Callable[..., Fed], tmp_path: Path
-) -> None:
-    made = fed(follow='keyframes')
-    for step in range(4):
-        made.lockstep.feed('/points', drive.scan(step))
-        made.lockstep.feed('/keyframe', drive.keyframe(step))
-    assert made.save(tmp_path / 'map').success
-    later = fed(follow='keyframes', map=str(tmp_path / 'map'))
-    before = [place.T_map_base for place in later.node.recognizer.places()]
-    elsewhere = np.array([se3.rotation_z(2.0) @ drive.true_pose(s) for s in range(4)])
-    moved = positions_message(np.arange(4), elsewhere, 1, 'map')
-    later.lockstep.feed('/graph/keyframes', moved)
-    later.lockstep.feed('/points', drive.scan(10))
-    later.lockstep.feed('/keyframe', _numbered(drive.keyframe(10), 0))
-    later.lockstep.feed('/graph/keyframes', moved)
-    assert later.answers == []
-    assert later.counted('rejected keyframe: other session') == 1
-    assert 'load the map of the same drive' in later.node.diagnostics.status().message
-    for place, T_map_base in zip(later.node.recognizer.places(), before, strict=True):
-        np.testing.assert_array_equal(place.T_map_base, T_map_base)
-    later.lockstep.feed('/points', drive.scan(12))
-    later.lockstep.feed('/keyframe', _numbered(drive.keyframe(12), 4))
-    assert len(later.answers) == 1
-    assert later.node.diagnostics.status().level == DiagnosticStatus.WARN
-
-
-def _numbered(message: Any, id: int) -> Any:
-    message.id = id
-    return message
-
-
-def test_a_keyframe_whose_cloud_never_came_is_counted(fed: Callable[..., Fed]) -> None:
-    made = fed(follow='keyframes')
-    for step in range(25):
-        made.lockstep.feed('/keyframe', drive.keyframe(step))
-    assert made.counted('rejected keyframe: its cloud did not come') == 5
-    made.lockstep.feed('/points', drive.scan(24))  # late, but it comes
-    assert len(made.answers) == 1
 
 
 def test_relocalization_publishes_one_initial_pose(
