@@ -13,9 +13,9 @@ from lcd_common.errors import LocalizationError
 def spin(*nodes: Node) -> None:
     """Spin nodes on one executor until Ctrl-C or shutdown, then destroy them."""
     executor = SingleThreadedExecutor()
-    for node in nodes:
-        executor.add_node(node)
     try:
+        for node in nodes:
+            executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
