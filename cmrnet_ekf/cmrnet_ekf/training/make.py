@@ -18,11 +18,11 @@ from cmrnet_ekf.mapping.map_builder import MapBuilder
 from cmrnet_ekf.mapping.settings import MapConfig
 from cmrnet_ekf.mapping.tile_folder import TileFolder
 from cmrnet_ekf.pose_sampling import STAGES
-from cmrnet_ekf.training.overrides import changed
 from cmrnet_ekf.training.sample_maker import SamplesConfig, make_samples
 from cmrnet_ekf.training.variants import NETWORKS
 from lcd_common.command_line import run
 from lcd_common.errors import ConfigError, DataError
+from lcd_common.setting_changes import changed
 from lcd_common.trajectory import read_tum
 
 _log = logging.getLogger(__name__)

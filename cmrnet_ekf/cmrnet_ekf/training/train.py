@@ -17,13 +17,13 @@ from cmrnet_ekf.networks import checkpoint
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.predictors import Predictor
 from cmrnet_ekf.training.curves import draw_curves
-from cmrnet_ekf.training.overrides import changed
 from cmrnet_ekf.training.sample_set import SampleSet
 from cmrnet_ekf.training.trainer import Trainer
 from cmrnet_ekf.training.validation import validate
 from cmrnet_ekf.training.variants import NETWORKS, VARIANTS, Variant, variant
 from lcd_common.command_line import run
 from lcd_common.errors import ConfigError
+from lcd_common.setting_changes import changed
 
 _log = logging.getLogger(__name__)
 _EXAMPLES = """

@@ -13,9 +13,12 @@ _RING_WEIGHT = 2.0
 class NetVlad(nn.Module):
     """Aggregate features around learnt clusters (thesis equations 7 and 8), then compress."""
 
-    def __init__(self, feature_size: int, clusters: int, size: int) -> None:
+    def __init__(
+        self, feature_size: int, clusters: int, size: int, *, unit_length: bool = True
+    ) -> None:
         """Make the layer for features [N x D], K clusters and descriptors [G]."""
         super().__init__()
+        self.unit_length = unit_length
         scale = 1.0 / math.sqrt(feature_size)
         # Batch normalisation takes the place of b_k, as in the authors' code.
         self.assign = nn.Parameter(torch.randn(feature_size, clusters) * scale)
@@ -26,14 +29,15 @@ class NetVlad(nn.Module):
         self.gate = ContextGating(size)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return descriptors [B x G] of unit length from features [B x N x D]."""
+        """Return descriptors [B x G], of unit length unless told, from features [B x N x D]."""
         clouds, number = features.shape[:2]
-        scores = self.assign_norm((features @ self.assign).view(clouds * number, -1))
+        scores = self.assign_norm((features @ self.assign).reshape(clouds * number, -1))
         a = torch.softmax(scores, -1).view(clouds, number, -1)
         vlad = vlad_sums(features, a, self.centres)
         vlad = functional.normalize(vlad, dim=2)  # each cluster counts alike
         flat = functional.normalize(vlad.reshape(clouds, -1), dim=1)
-        return functional.normalize(self.gate(self.compress_norm(flat @ self.compress)), dim=1)
+        gated: Tensor = self.gate(self.compress_norm(flat @ self.compress))
+        return functional.normalize(gated, dim=1) if self.unit_length else gated
 
 
 def vlad_sums(features: Tensor, a: Tensor, centres: Tensor) -> Tensor:

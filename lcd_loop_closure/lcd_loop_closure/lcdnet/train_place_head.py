@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from lcd_common.command_line import run
 from lcd_common.errors import ConfigError
+from lcd_common.setting_changes import changed
 from lcd_loop_closure.lcdnet import checkpoint
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
@@ -28,7 +29,6 @@ from lcd_loop_closure.lcdnet.place_features import (
     joined_features,
 )
 from lcd_loop_closure.lcdnet.place_head import PlaceHeadConfig, judge_place_head, train_place_head
-from lcd_loop_closure.lcdnet.setting_changes import changed
 from lcd_loop_closure.lcdnet.training_drives import simulated_drive
 
 _EXAMPLES = """

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lcd_common.errors import ConfigError
-from uncertain_place_recognition.networks.netvlad import NetVlad
+from lcd_loop_closure.lcdnet.netvlad import NetVlad
 from uncertain_place_recognition.networks.pointnetvlad import (
     COMPACT,
     PORT,
@@ -24,7 +24,7 @@ def test_the_port_has_as_many_parameters_as_published():
 
 def test_netvlad_against_its_formula():
     torch.manual_seed(0)
-    layer = NetVlad(5, 3, 4)
+    layer = NetVlad(5, 3, 4, unit_length=False)
     layer(torch.randn(8, 20, 5))
     layer.eval()
     features = torch.randn(2, 20, 5)

@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
+from lcd_loop_closure.lcdnet.netvlad import NetVlad
 from uncertain_place_recognition.networks.embedding import PlaceNetwork
-from uncertain_place_recognition.networks.netvlad import NetVlad
 
 
 @config
@@ -87,7 +87,7 @@ class BevNetVlad(PlaceNetwork):
                 stages.append(_Block(before, width, stride, round_about))
                 before = width
         self.stages = nn.Sequential(*stages)
-        self.vlad = NetVlad(before, s.clusters, s.size)
+        self.vlad = NetVlad(before, s.clusters, s.size, unit_length=False)
 
     def prepare(self, points: Tensor) -> Tensor:
         """Return images [B x C x rows x columns]: how many points stand on a pixel, compressed."""

@@ -8,8 +8,8 @@ from torch.nn import functional
 
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
+from lcd_loop_closure.lcdnet.netvlad import NetVlad
 from uncertain_place_recognition.networks.embedding import PlaceNetwork
-from uncertain_place_recognition.networks.netvlad import NetVlad
 
 
 @config
@@ -64,7 +64,7 @@ class PointNetVlad(PlaceNetwork):
         widths = (3, *s.widths)
         self.layers = nn.ModuleList([nn.Linear(a, b) for a, b in pairwise(widths)])
         self.norms = nn.ModuleList([nn.BatchNorm1d(width) for width in s.widths])
-        self.vlad = NetVlad(s.widths[-1], s.clusters, s.size)
+        self.vlad = NetVlad(s.widths[-1], s.clusters, s.size, unit_length=False)
 
     def prepare(self, points: Tensor) -> Tensor:
         """Return the points that are seen [B x N x 3]."""

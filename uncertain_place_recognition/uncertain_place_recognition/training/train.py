@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from lcd_common.command_line import run
 from lcd_common.errors import ConfigError, DataError
+from lcd_common.setting_changes import changed
 from lcd_loop_closure.lcdnet.device import choose_device
 from uncertain_place_recognition.ensemble import BEST, PACKED, EmbeddingEnsemble
 from uncertain_place_recognition.networks.embedding import PlaceNetwork
@@ -67,10 +68,10 @@ def _metric(role: str, data: _Data, out: Path, arguments: argparse.Namespace) ->
     """Train a network by the distance of places; tell whether it is done."""
     changes = {'dropout': arguments.rate} if role == 'dropout' else {}
     settings = shape(arguments.network, arguments.preset, **changes)
-    settings = _changed(settings, arguments.set)
+    settings = changed(settings, arguments.set)
     rate = _RATES.get((arguments.network, arguments.preset), TrainingConfig().learning_rate)
     training = TrainingConfig(learning_rate=rate, seed=arguments.seed)
-    training = _changed(training, arguments.train)
+    training = changed(training, arguments.train)
     torch.manual_seed(training.seed)
     return _train(role, build(settings), training, None, data, out, arguments)
 
@@ -92,7 +93,7 @@ def _student(
         learning_rate=_STUN_RATE if role == 'stun' else theirs['learning_rate'],
         seed=seed,
     )
-    training = _changed(training, arguments.train)
+    training = changed(training, arguments.train)
     torch.manual_seed(training.seed)
     network = build(settings)
     if role == 'stun':
@@ -110,8 +111,8 @@ def _train(
     arguments: argparse.Namespace,
 ) -> bool:
     device = choose_device(arguments.device)
-    augmentation = _changed(AugmentationConfig(), arguments.augment)
-    pairs = _changed(PairConfig(), arguments.pairs)
+    augmentation = changed(AugmentationConfig(), arguments.augment)
+    pairs = changed(PairConfig(), arguments.pairs)
     out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(
         network, data.training, out, training,
@@ -237,35 +238,6 @@ def _teacher(path: Path) -> tuple[PlaceNetwork, dict[str, Any]]:
     if 'training' not in facts:
         raise ConfigError(f'{path}: does not say how it was trained; train a teacher first')
     return networks[0], facts
-
-
-def _changed(settings: Any, changes: Sequence[str]) -> Any:
-    """Return settings with NAME=VALUE changes; raises ConfigError for what there is not."""
-    known = {field.name: field.default for field in fields(settings)}
-    values = {}
-    for change in changes:
-        name, equals, text = change.partition('=')
-        if not equals or name not in known:
-            raise ConfigError(
-                f'{change!r} is no setting; expected NAME=VALUE, NAME one of: '
-                + ', '.join(sorted(known))
-            )
-        try:
-            values[name] = _value(text, known[name])
-        except ValueError:
-            kind = type(known[name]).__name__
-            raise ConfigError(f'{change!r}: expected a value of type {kind}') from None
-    return replace(settings, **values)
-
-
-def _value(text: str, like: Any) -> Any:
-    if isinstance(like, bool):
-        if text.lower() not in ('true', 'false'):
-            raise ValueError
-        return text.lower() == 'true'
-    if isinstance(like, tuple):
-        return tuple(type(like[0])(p) if like else float(p) for p in text.split(',') if p)
-    return type(like)(text)
 
 
 def _postfix(loss: float, active: float, judged: Judgement | None) -> str:

@@ -1,4 +1,4 @@
-"""Change settings from the command line: NAME=VALUE."""
+"""Change settings as a command line tells: NAME=VALUE."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -10,14 +10,14 @@ Settings = TypeVar('Settings')
 
 
 def changed(settings: Settings, changes: Sequence[str]) -> Settings:
-    """Return settings with changes; raises ConfigError for what there is not."""
+    """Return settings with `NAME=VALUE` changes; raises ConfigError for what there is not."""
     known = {field.name: field.default for field in fields(settings)}  # type: ignore[arg-type]
     values = {}
     for change in changes:
         name, equals, text = change.partition('=')
         if not equals or name not in known:
             raise ConfigError(
-                f'{change!r} is no setting; expected NAME=VALUE, NAME one of '
+                f'{change!r} is no setting; expected NAME=VALUE, NAME one of: '
                 + ', '.join(sorted(known))
             )
         try:
@@ -34,5 +34,6 @@ def _value(text: str, like: Any) -> Any:
             raise ValueError
         return text.lower() == 'true'
     if isinstance(like, tuple):
-        return tuple(type(like[0])(part) for part in text.split(',') if part)
+        kind = type(like[0]) if like else float
+        return tuple(kind(part) for part in text.split(',') if part)
     return type(like)(text)
