@@ -19,7 +19,7 @@ setup(
     python_requires='>=3.11',
     # requirements/ pins everything; the suite's own packages are named in package.xml alone,
     # because pip would look for packages of these names elsewhere.
-    install_requires=['numpy', 'scipy', 'torch'],
+    install_requires=['numpy', 'safetensors', 'scipy', 'torch'],
     extras_require={'test': ['pytest']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -128,7 +128,7 @@ def test_what_is_wrong_is_said(tmp_path):
 
 
 def _spoil(path):
-    from lcd_loop_closure.lcdnet.checkpoint import read, write
+    from lcd_common.weights_file import read, write
 
     stored = read(path)
     tensors = {k: v for k, v in stored.tensors.items() if 'compress' not in k}

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from cmrnet_ekf.networks import checkpoint
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.networks.losses import LossConfig, pose_losses
 from cmrnet_ekf.training.sample_set import SampleSet, draw
+from lcd_common import weights_file
 from lcd_common.errors import ConfigError, LocalizationError
 from lcd_common.settings import config, setting
 
@@ -118,9 +118,9 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint."""
-        checkpoint.write(
+        weights_file.write(
             self.checkpoint_path,
-            checkpoint.train_state(self.network, self.optimizer),
+            weights_file.train_state(self.network, self.optimizer),
             {
                 'step': self.step,
                 'training': asdict(self.settings),
@@ -130,9 +130,9 @@ class Trainer:
         )
 
     def _resume(self) -> None:
-        stored = checkpoint.read(self.checkpoint_path)
+        stored = weights_file.read(self.checkpoint_path)
         try:
-            checkpoint.restore(self.network, self.optimizer, stored.tensors)
+            weights_file.restore(self.network, self.optimizer, stored.tensors)
             self.step = int(stored.facts['step'])
         except (RuntimeError, KeyError, ValueError) as error:
             raise ConfigError(

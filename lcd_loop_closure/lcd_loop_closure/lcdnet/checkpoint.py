@@ -1,60 +1,20 @@
-"""Keep networks and the state of training in safetensors: nothing is unpickled."""
+"""Keep LCDNet with its configuration in a file of weights."""
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
-from torch import Tensor, nn
 
 from lcd_common.errors import DataError
+from lcd_common.weights_file import read, weights_of, write
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
 from lcd_loop_closure.lcdnet.network import Lcdnet
 
 
-@dataclass(frozen=True)
-class Stored:
-    """What a file of weights holds: tensors by name, and facts as JSON."""
-
-    tensors: dict[str, Tensor]
-    facts: dict[str, Any]
-
-
-def write(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Write tensors and facts; a crash leaves the file of before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix('.part')
-    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    save_file(whole, part, {'facts': json.dumps(facts)})
-    part.replace(path)
-
-
-def read(path: Path, device: torch.device | str = 'cpu') -> Stored:
-    """Read a file of weights; raises DataError when it is none."""
-    try:
-        with safe_open(path, 'pt', device=str(device)) as file:
-            names = list(file.keys())
-            facts = json.loads((file.metadata() or {})['facts'])
-            return Stored({name: file.get_tensor(name) for name in names}, facts)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        raise DataError(
-            f'{path} holds no weights of this suite ({error}); expected a .safetensors file that '
-            'train_lcdnet wrote'
-        ) from error
-
-
 def save_network(path: Path, network: Lcdnet, facts: dict[str, Any], half: bool = False) -> None:
     """Write a network with its configuration, in half precision if asked."""
-    tensors = {
-        name: tensor.half() if half and tensor.is_floating_point() else tensor
-        for name, tensor in network.state_dict().items()
-    }
-    write(path, tensors, {**facts, 'config': asdict(network.settings)})
+    write(path, weights_of(network, half=half), {**facts, 'config': asdict(network.settings)})
 
 
 def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Lcdnet, dict[str, Any]]:
@@ -63,7 +23,7 @@ def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Lcdnet
     Raises:
         DataError: the file holds none, or tensors do not fit the configuration.
     """
-    stored = read(path, device)
+    stored = read(path, device, writer='train_lcdnet')
     try:
         given: dict[str, Any] = stored.facts['config']
         settings = LcdnetConfig(
@@ -76,27 +36,3 @@ def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Lcdnet
     except (KeyError, TypeError, RuntimeError) as error:
         raise DataError(f'{path}: the weights do not fit the network: {error}') from error
     return network.to(device).eval(), stored.facts
-
-
-def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Return the state of an optimizer as named tensors."""
-    return {
-        f'{number}.{name}': value
-        for number, state in optimizer.state_dict()['state'].items()
-        for name, value in state.items()
-    }
-
-
-def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Put back what `optimizer_tensors` returned."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        number, name = key.split('.', 1)
-        state.setdefault(int(number), {})[name] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), 'state': state})
-
-
-def train_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Return all tensors that resuming needs."""
-    tensors = {f'network.{name}': value for name, value in module.state_dict().items()}
-    return tensors | {f'adam.{n}': v for n, v in optimizer_tensors(optimizer).items()}

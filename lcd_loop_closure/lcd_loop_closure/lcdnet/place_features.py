@@ -1,6 +1,5 @@
 """Features of sweeps, computed once: what the place head learns from while the rest is at rest."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,13 +8,12 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError, DataError
+from lcd_common.weights_file import read, write
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig, augmented
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import PlaceSweep, thinned
@@ -56,10 +54,8 @@ class PlaceFeatures:
 
     def save(self, path: Path, made_by: str) -> None:
         """Write them; `made_by` tells which weights and settings made them."""
-        part = path.with_suffix('.part')
-        tensors = {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
-        save_file(tensors, part, {'made_by': json.dumps(made_by)})
-        part.replace(path)
+        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
+        write(path, tensors, {'made_by': made_by})
 
     @classmethod
     def load(cls, path: Path, made_by: str) -> 'PlaceFeatures | None':
@@ -70,13 +66,13 @@ class PlaceFeatures:
         """
         if not path.is_file():
             return None
+        stored = read(path, writer='train_lcdnet_place_head')
+        if stored.facts.get('made_by') != made_by:
+            return None
         try:
-            with safe_open(path, 'pt') as file:
-                if json.loads(file.metadata()['made_by']) != made_by:
-                    return None
-                return cls(**{field.name: file.get_tensor(field.name) for field in fields(cls)})
-        except Exception as error:
-            raise DataError(f'{path} holds no features ({error}); delete it') from error
+            return cls(**stored.tensors)
+        except TypeError as error:
+            raise DataError(f'{path} holds other tensors ({error}); delete it') from error
 
 
 @torch.inference_mode()

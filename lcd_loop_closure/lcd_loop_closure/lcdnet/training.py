@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from lcd_common import weights_file
 from lcd_common.errors import LocalizationError
 from lcd_common.settings import config, setting
-from lcd_loop_closure.lcdnet import checkpoint
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.batches import Batch, draw_batch
 from lcd_loop_closure.lcdnet.losses import (
@@ -148,21 +148,16 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint."""
         if self._rank == 0:
-            checkpoint.write(
+            weights_file.write(
                 self.checkpoint_path,
-                checkpoint.train_state(self.network, self.optimizer),
+                weights_file.train_state(self.network, self.optimizer),
                 {'step': self.step, 'training': asdict(self.settings),
                  'config': asdict(self.network.settings)},
             )  # fmt: skip
 
     def _resume(self) -> None:
-        stored = checkpoint.read(self.checkpoint_path)
-        parts: dict[str, dict[str, torch.Tensor]] = {'network': {}, 'adam': {}}
-        for name, tensor in stored.tensors.items():
-            kind, rest = name.split('.', 1)
-            parts[kind][rest] = tensor
-        self.network.load_state_dict(parts['network'])
-        checkpoint.restore_optimizer(self.optimizer, parts['adam'])
+        stored = weights_file.read(self.checkpoint_path)
+        weights_file.restore(self.network, self.optimizer, stored.tensors)
         self.step = int(stored.facts['step'])
 
     def _learning_rate(self) -> float:

@@ -190,7 +190,7 @@ def test_features_are_kept_with_what_made_them(tmp_path):
     again = PlaceFeatures.load(path, 'a')
     assert torch.equal(again.values, found.values) and torch.equal(again.path_m, found.path_m)
     path.write_bytes(b'nothing')
-    with pytest.raises(DataError, match='holds no features'):
+    with pytest.raises(DataError, match='train_lcdnet_place_head wrote'):
         PlaceFeatures.load(path, 'a')
 
 

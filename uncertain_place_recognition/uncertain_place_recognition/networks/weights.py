@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lcd_common.errors import DataError, LocalizationError
-from lcd_loop_closure.lcdnet.checkpoint import read, write
+from lcd_common.weights_file import read, write
 from uncertain_place_recognition.networks.embedding import PlaceNetwork
 from uncertain_place_recognition.networks.shapes import build, name_of, settings_from
 

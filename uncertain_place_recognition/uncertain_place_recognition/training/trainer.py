@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lcd_common import weights_file
 from lcd_common.errors import ConfigError, LocalizationError
 from lcd_common.settings import config, setting
-from lcd_loop_closure.lcdnet import checkpoint
 from uncertain_place_recognition.networks.embedding import Embedding, PlaceNetwork
 from uncertain_place_recognition.runs import SubmapRun
 from uncertain_place_recognition.training.augmentation import AugmentationConfig, augmented
@@ -181,11 +181,11 @@ class Trainer:
             'training': asdict(self.settings),
             'config': asdict(self.network.settings),
         }
-        tensors = checkpoint.train_state(self.network, self.optimizer)
-        checkpoint.write(self.checkpoint_path, tensors, facts)
+        tensors = weights_file.train_state(self.network, self.optimizer)
+        weights_file.write(self.checkpoint_path, tensors, facts)
 
     def _resume(self) -> None:
-        stored = checkpoint.read(self.checkpoint_path)
+        stored = weights_file.read(self.checkpoint_path)
         for name, mine in (('training', self.settings), ('config', self.network.settings)):
             theirs = stored.facts[name]
             changed = [k for k, v in json.loads(json.dumps(asdict(mine))).items()
@@ -195,12 +195,7 @@ class Trainer:
                     f'{self.folder} holds a training with another {", ".join(changed)}; go on with '
                     'the same settings, or choose another --out'
                 )
-        parts: dict[str, dict[str, Tensor]] = {'network': {}, 'adam': {}}
-        for name, tensor in stored.tensors.items():
-            kind, rest = name.split('.', 1)
-            parts[kind][rest] = tensor
-        self.network.load_state_dict(parts['network'])
-        checkpoint.restore_optimizer(self.optimizer, parts['adam'])
+        weights_file.restore(self.network, self.optimizer, stored.tensors)
         self.step, self._collapsed = int(stored.facts['step']), int(stored.facts['collapsed'])
 
     def _learning_rate(self) -> float:
