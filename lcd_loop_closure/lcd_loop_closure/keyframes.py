@@ -43,7 +43,7 @@ class Keyframe:
 class KeyframeConfig:
     """When a scan becomes a keyframe."""
 
-    distance: float = setting(2.0, 'travelled distance between keyframes', unit='m', low=0.1)
+    distance: float = setting(3.0, 'travelled distance between keyframes', unit='m', low=0.1)
     angle: float = setting(0.5, 'turned angle between keyframes', unit='rad', low=0.01, high=3.15)
 
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,12 @@ from lcd_msgs.srv import LoadMap
 
 pytestmark = pytest.mark.ros
 Make = Callable[..., Any]
+
+
+@pytest.fixture
+def make(make: Make) -> Make:
+    """Make nodes with more keyframes than by default: the made-up drive is short."""
+    return partial(make, keyframes__distance=2.0)
 
 
 class Fed:
