@@ -16,7 +16,7 @@ from lcd_loop_closure.voxel_gaussians import VoxelGaussians
 from lcd_loop_closure.yaw_search import yaw_candidates
 
 _SAMPLE = 1000  # points of a sweep that are matched with surfaces
-_BRIEF_SHARE = 3  # one point of so many is enough for a pose that the polish will improve
+_THIN_SHARE = 3  # one point of so many is enough for a pose that the polish will improve
 _RECENT = 20  # sweeps whose fitness says what is usual
 _DOUBTFUL = 0.75  # of the usual fitness: less is worth a search
 _BETTER = 1.1  # times the fitness that a search must find to be believed
@@ -144,6 +144,7 @@ class SweepRegistration:
         *,
         rough: bool = False,
         brief: bool = False,
+        thin: bool = False,
     ) -> Fit:
         """Register a sweep from one guess.
 
@@ -153,8 +154,9 @@ class SweepRegistration:
             prior: 6x6 information that keeps what the sweep does not tell.
             rough: for a guess that may be far off or wrong.
             brief: leave the last centimetres to the polish, which is faster at it.
+            thin: with a part of the points, for a pose that the polish will improve.
         """
-        source = sweep.source[::_BRIEF_SHARE] if brief else sweep.source
+        source = sweep.source[::_THIN_SHARE] if thin else sweep.source
         T_kiss = self._kiss.align(source, guess, rough=rough, brief=brief)
         on_surfaces = self.polished(sweep, T_kiss, prior)
         disagreement = se3.log(se3.inverse(T_kiss) @ on_surfaces.T_odom_middle)
@@ -189,7 +191,7 @@ class SweepRegistration:
         limit = max(self.settings.min_fitness, self.settings.min_fitness_ratio * usual)
         doubtful = max(limit, _DOUBTFUL * usual)
         brief = self.settings.polish and self.sweeps >= _RECENT
-        fit = self.fit(sweep, guess, prior, brief=brief)
+        fit = self.fit(sweep, guess, prior, brief=brief, thin=brief)
         if brief and fit.matches.fitness < doubtful:
             fit = self._once_more(sweep, fit, guess, prior, doubtful)
             fit = replace(fit, surprised=True)
@@ -238,12 +240,13 @@ class SweepRegistration:
         """Register anew from a turn that began or ended, and else as long as it takes."""
         turned = yaw_candidates(sweep.sample, [guess], self._surfaces, 1, _TURNS, _TURN_SPAN)[0]
         if se3.distance(guess, turned)[1] > 1e-6:
-            again = self.fit(sweep, turned, prior, brief=True)
+            again = self.fit(sweep, turned, prior, brief=True, thin=True)
             fit = max(fit, again, key=lambda one: one.matches.fitness)
         if fit.matches.fitness >= doubtful:
             return fit
-        return self.fit(sweep, fit.T_odom_middle, prior)
+        return self.fit(sweep, fit.T_odom_middle, prior, thin=True)
 
     def _search(self, sweep: Sweep, centres: list[Array], prior: Array) -> list[tuple[Sweep, Fit]]:
         poses = yaw_candidates(sweep.sample, centres, self._surfaces, _HEADINGS)
-        return [(sweep, self.fit(sweep, T, prior, rough=True)) for T in poses]
+        thin = self.settings.polish and self.sweeps >= _RECENT
+        return [(sweep, self.fit(sweep, T, prior, rough=True, thin=thin)) for T in poses]
