@@ -22,6 +22,7 @@ from uncertain_place_recognition.evaluation.study import (
     study,
 )
 from uncertain_place_recognition.query_table import QueryTable, query_table
+from uncertain_place_recognition.run_inputs import ROLES
 
 TARGETS = (0.01, 0.05)
 # Tables and curves of all methods are of this one; both are in the interchange.
@@ -32,7 +33,8 @@ def exchanged(work: Path, quick: bool = False) -> dict[str, Any]:
     """Return recall between members trained by triplets and by distillation (Tables 4.1, 4.2)."""
     figures: dict[str, Any] = {}
     for architecture in ARCHITECTURES:
-        runs = embedded('town', _set('town', quick), architecture, work, ('students', 'naive'))
+        roles = ROLES if architecture == MAIN else ('students', 'naive')  # the others are not asked
+        runs = embedded('town', _set('town', quick), architecture, work, roles)
         for name, role in (('triplet', 'naive'), ('distilled', 'students')):
             found = interchange(runs, role)
             assert found is not None

@@ -19,6 +19,7 @@ from uncertain_place_recognition.submap import SubmapMaker
 
 ARCHITECTURES = ('minkloc3d', 'pointnetvlad')
 SPACING_M = 10.0
+_WEIGHTS = 'PLACE_WEIGHTS'
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def weights(architecture: str) -> dict[str, Path]:
     Raises:
         DataError: there are none.
     """
-    named = os.environ.get('PLACE_WEIGHTS')
+    named = os.environ.get(_WEIGHTS)
     if not named:
         raise DataError(
             'set PLACE_WEIGHTS to a folder with weights, <architecture>/<role> each: '
@@ -87,23 +88,28 @@ def embedded(
         name: of the set.
         chosen: its runs.
         architecture: whose weights.
-        work: folder for runs (work/runs/<set>) and embeddings (work/embedded/...); either may be
-            filled beforehand, on a machine with a GPU.
+        work: folder for runs (work/runs/<set>_<length>m) and embeddings (work/embedded/...);
+            either may be filled beforehand, on a machine with a GPU.
         roles: of the ensembles that embed.
     """
-    kept = work / 'embedded' / architecture / name
+    folder = f'{name}_{chosen.length_m:.0f}m'
+    kept = work / 'embedded' / architecture / folder
     names = [f'{town_name(chosen, seed)}_run{run}' for seed, run in _drives(chosen)]
     files = [kept / f'{one}.npz' for one in names]
     if all(file.is_file() for file in files):
-        return [EmbeddedRun.load(file) for file in files]
-    found = {role: path for role, path in weights(architecture).items() if role in roles}
+        runs = [EmbeddedRun.load(file) for file in files]
+        if not os.environ.get(_WEIGHTS) or not set(_found(architecture, roles)) - set(
+            runs[0].members
+        ):
+            return runs  # nothing would be added
+    found = _found(architecture, roles)
     ensembles = load_ensembles([f'{role}={path}' for role, path in found.items()], 'cpu')
     if not ensembles:
         raise DataError(f'{architecture} has none of the ensembles {", ".join(roles)}')
     maker = SubmapMaker(next(iter(ensembles.values())).submap)
     made = []
     for one, (seed, run) in zip(names, tqdm(_drives(chosen), f'runs of {name}'), strict=True):
-        path = work / 'runs' / name / f'{one}.npz'
+        path = work / 'runs' / folder / f'{one}.npz'
         made.append(path)
         if not path.is_file():
             drive = simulated_drive(
@@ -112,6 +118,10 @@ def embedded(
             world = town_name(chosen, seed)
             run_of_drive(drive, maker, spacing_m=SPACING_M, world=world).save(path)
     return load_embedded(made, ensembles, kept)
+
+
+def _found(architecture: str, roles: tuple[str, ...]) -> dict[str, Path]:
+    return {role: path for role, path in weights(architecture).items() if role in roles}
 
 
 def town_name(chosen: TestSet, seed: int) -> str:

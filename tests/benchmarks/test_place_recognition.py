@@ -62,15 +62,43 @@ def test_test_sets_are_large_enough_and_of_towns_nobody_trained_on():
     assert not set(seeds) & set(calibration.seeds)
 
 
-def test_embeddings_made_elsewhere_are_taken(tmp_path):
+def test_embeddings_made_elsewhere_are_taken(tmp_path, monkeypatch):
+    monkeypatch.delenv('PLACE_WEIGHTS', raising=False)
     chosen = place_sets.TestSet((200,), 2, 100.0)
     for run in range(2):
         made_run(f'r{run}').save(
-            tmp_path / 'embedded' / 'minkloc3d' / 'town' / f'town_200_hdl64_run{run}.npz'
+            tmp_path / 'embedded' / 'minkloc3d' / 'town_100m' / f'town_200_hdl64_run{run}.npz'
         )
     found = place_sets.embedded('town', chosen, 'minkloc3d', tmp_path)
     assert [run.name for run in found] == ['r0', 'r1']
     assert isinstance(found[0], EmbeddedRun)
+
+
+def test_embeddings_that_lack_a_role_are_made_again(tmp_path, monkeypatch):
+    chosen = place_sets.TestSet((200,), 1, 100.0)
+    kept = tmp_path / 'embedded' / 'minkloc3d' / 'town_100m' / 'town_200_hdl64_run0.npz'
+    made_run('r0').save(kept)
+    has = set(EmbeddedRun.load(kept).members)
+    asked = []
+
+    def weights(architecture):
+        return {role: tmp_path / role for role in (*has, *extra)}
+
+    def load_ensembles(named, device):
+        asked.extend(named)
+        raise DataError('so far')
+
+    monkeypatch.setenv('PLACE_WEIGHTS', str(tmp_path))
+    monkeypatch.setattr(place_sets, 'weights', weights)
+    monkeypatch.setattr(place_sets, 'load_ensembles', load_ensembles)
+    extra = ()
+    assert [run.name for run in place_sets.embedded('town', chosen, 'minkloc3d', tmp_path)] == [
+        'r0'
+    ]
+    extra = ('new',)
+    with pytest.raises(DataError, match='so far'):
+        place_sets.embedded('town', chosen, 'minkloc3d', tmp_path, (*place_sets.ROLES, 'new'))
+    assert any(one.startswith('new=') for one in asked)
 
 
 def test_missing_weights_are_named(monkeypatch, tmp_path):
