@@ -42,6 +42,7 @@ setup(
             'build_lidar_map = cmrnet_ekf.mapping.build:main',
             'make_cmrnet_samples = cmrnet_ekf.training.make:main',
             'train_cmrnet = cmrnet_ekf.training.train:main',
+            'evaluate_cmrnet = cmrnet_ekf.evaluation.evaluate:main',
         ],
     },
     zip_safe=False,

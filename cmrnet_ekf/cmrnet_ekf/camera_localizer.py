@@ -80,7 +80,13 @@ class CameraLocalizer:
                 shift map and guess so that the vehicle is near the origin.
             T_map_guess: pose of base that is about right.
         """
-        image = torch.from_numpy(self.framing.image(pixels)).permute(2, 0, 1)[None]
+        return self.locate_framed(self.framing.image(pixels), points, T_map_guess)
+
+    def locate_framed(
+        self, framed: Pixels, points: NDArray[np.float32] | torch.Tensor, T_map_guess: se3.Array
+    ) -> PoseEstimate:
+        """Return the pose by an image that has been through `framing` before; see `locate`."""
+        image = torch.from_numpy(framed).permute(2, 0, 1)[None]
         T_map_body = T_map_guess @ self._T_base_body
         for predictor, imager in zip(self.stages, self._imagers, strict=True):
             T_map_looked = T_map_body

@@ -46,16 +46,19 @@ class Predictor:
         self._samples, self._seed = samples, seed
 
     @classmethod
-    def load(cls, path: Path, device: torch.device | str = 'cpu', samples: int = 30) -> 'Predictor':
+    def load(
+        cls, path: Path, device: torch.device | str = 'cpu', samples: int = 30, seed: int = 0
+    ) -> 'Predictor':
         """Read a network, or all networks of a folder as an ensemble.
+
+        A folder of train_cmrnet holds one network, its best; a folder of such folders is an
+        ensemble of theirs.
 
         Raises:
             DataError: there are none, or a file holds none.
         """
-        files = sorted(path.glob('*.safetensors')) if path.is_dir() else [path]
-        if not files or not files[0].is_file():
-            raise DataError(f'{path}: expected a .safetensors file or a folder of them, found none')
-        return cls([load_network(file, device)[0] for file in files], samples)
+        files = weights_in(path)
+        return cls([load_network(file, device)[0] for file in files], samples, seed)
 
     @property
     def kind(self) -> str:
@@ -65,6 +68,10 @@ class Predictor:
         if len(self.networks) > 1:
             return 'de'
         return 'mcd' if self.settings.dropout > 0 and self._samples > 1 else 'plain'
+
+    def with_samples(self, samples: int) -> 'Predictor':
+        """Return the same networks with another number of draws."""
+        return Predictor(self.networks, samples, self._seed)
 
     @property
     def device(self) -> torch.device:
@@ -78,16 +85,10 @@ class Predictor:
         See `Cmrnet.trunk`. MC dropout uses one pass through the trunk.
         """
         image, lidar = image.to(self.device), lidar.to(self.device)
-        kind = self.kind
-        if kind == 'de':
-            return gaussian_of_samples(
-                np.stack([means(network(image, lidar)) for network in self.networks])
-            )
+        if self.kind in ('mcd', 'de'):
+            return gaussian_of_samples(self.draws(image, lidar))
         network = self.networks[0]
-        features = network.trunk(image, lidar)
-        if kind == 'mcd':
-            return gaussian_of_samples(self._draws(network, features))
-        output = network.head(features)
+        output = network.head(network.trunk(image, lidar))
         if isinstance(output, Evidence):
             return _student_t(output)
         if isinstance(output, GaussianPose):
@@ -96,7 +97,22 @@ class Predictor:
         nothing = np.zeros_like(mean)
         return PoseBelief(mean, nothing, np.full_like(mean, np.inf), nothing)
 
-    def _draws(self, network: Cmrnet, features: Tensor) -> Array:
+    @torch.no_grad()
+    def draws(self, image: Tensor, lidar: Tensor) -> Array:
+        """Return the components [S x B x 6] of each draw of MC dropout, or of each member.
+
+        Raises:
+            ConfigError: this is neither.
+        """
+        if self.kind not in ('mcd', 'de'):
+            raise ConfigError(f'{self.kind} draws nothing: expected MC dropout or an ensemble')
+        image, lidar = image.to(self.device), lidar.to(self.device)
+        if self.kind == 'de':
+            return np.stack([means(network(image, lidar)) for network in self.networks])
+        network = self.networks[0]
+        return self._dropped(network, network.trunk(image, lidar))
+
+    def _dropped(self, network: Cmrnet, features: Tensor) -> Array:
         """Return sampled components [S x B x 6] of features [B x F]."""
         count, batch = self._samples, len(features)
         devices = [features.device] if features.device.type == 'cuda' else []
@@ -108,6 +124,22 @@ class Predictor:
             finally:
                 network.head.dropout.eval()
         return means(output).reshape(count, batch, 6)
+
+
+def weights_in(path: Path) -> list[Path]:
+    """Return the files of weights that a path names; see `Predictor.load`.
+
+    Raises:
+        DataError: there are none.
+    """
+    files = [path]
+    if path.is_dir():
+        # What a training goes on from is no network of its own.
+        files = sorted(f for f in path.glob('*.safetensors') if f.name != 'checkpoint.safetensors')
+        files = files or sorted(path.glob('*/best.safetensors'))
+    if not files or not files[0].is_file():
+        raise DataError(f'{path}: expected a .safetensors file or a folder of them, found none')
+    return files
 
 
 def means(output: Output) -> Array:

@@ -32,6 +32,7 @@ class LocalMap:
             MapError: there is none, or it has no points.
         """
         self.settings = settings or LocalMapConfig()
+        self.path = path
         self._folder = TileFolder.open(path)
         self._there = set(self._folder.tiles())
         if not self._there:

@@ -12,11 +12,8 @@ from tqdm import tqdm
 
 from bags.input_arguments import add_input, add_span, drive_from
 from bags.inputs import span_ns
-from cmrnet_ekf.mapping.build import drive_sweeps
 from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig
-from cmrnet_ekf.mapping.map_builder import MapBuilder
 from cmrnet_ekf.mapping.settings import MapConfig
-from cmrnet_ekf.mapping.tile_folder import TileFolder
 from cmrnet_ekf.pose_sampling import STAGES
 from cmrnet_ekf.training.sample_maker import SamplesConfig, make_samples
 from cmrnet_ekf.training.variants import NETWORKS
@@ -64,28 +61,16 @@ def _make(arguments: argparse.Namespace) -> None:
 
 
 def _town(number: int, arguments: argparse.Namespace) -> None:
-    from bags.simulation.drive import SensorsConfig, SimulatedDrive
-    from bags.simulation.itinerary import JourneyConfig
-    from bags.simulation.town import SimulatedTown
+    from cmrnet_ekf.training.towns import map_town, seen_town
 
-    journey = JourneyConfig(length=arguments.length)
-    town = SimulatedTown(number)
-    seen = SimulatedDrive(town, 1, journey, SensorsConfig(camera=True, gnss=False, imu=''))
+    seen = seen_town(number, arguments.length)
     out = arguments.out / seen.name
     if (out / 'facts.json').is_file():
         _log.info('%s: there already', out)
         return
     path = (arguments.maps or arguments.out / 'maps') / f'town_{number}'
-    if not (path / 'done').is_file():
-        settings = MapConfig(voxel=arguments.voxel)
-        builder = MapBuilder(TileFolder.create(path, settings), settings)
-        mapped = SimulatedDrive(town, 0, journey, SensorsConfig(gnss=False, imu=''))
-        sweeps = drive_sweeps(mapped, mapped.truth(), every=arguments.every, labels='')
-        total = len(mapped.truth()) // arguments.every
-        for sweep in tqdm(sweeps, f'map of town {number}', total, disable=arguments.quiet):
-            builder.add(sweep.cloud, sweep.T_map_base, sweep.T_base_sensor, sweep.moving)
-        builder.finish()
-        (path / 'done').touch()
+    settings = MapConfig(voxel=arguments.voxel)
+    map_town(path, number, arguments.length, settings, arguments.every, arguments.quiet)
     _samples(out, seen, seen.truth(), path, arguments, (None, None))
 
 

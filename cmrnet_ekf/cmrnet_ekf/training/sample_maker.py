@@ -79,6 +79,7 @@ def make_samples(
     count = len(stamps) * settings.draws
     lidar = open_memmap(out / 'lidar.part.npy', 'w+', np.uint16, (count, *shape))
     guesses, frame_of, kept = np.empty((count, 4, 4)), np.empty(count, np.int64), 0
+    places_of = np.empty((len(stamps), 4, 4))
     for record, T_map_base in _frames(drive, poses, stamps):
         T_camera_guess = noise.draw(rng, settings.draws)
         points, origin = local_map.around(T_map_base)
@@ -94,6 +95,7 @@ def make_samples(
         rows = slice(kept * settings.draws, (kept + 1) * settings.draws)
         lidar[rows] = np.rint(np.minimum(images / network.max_depth, 1.0) * FULL_SCALE)
         guesses[rows], frame_of[rows] = T_camera_guess, kept
+        places_of[kept] = T_map_base @ T_base_body
         kept += 1
     if not kept:
         raise DataError(f'{out}: no frame of {drive.path} shows the map; do poses and map agree?')
@@ -102,6 +104,7 @@ def make_samples(
     _finish(out / 'lidar.part.npy', lidar, used)
     np.save(out / 'guesses.npy', guesses[:used])
     np.save(out / 'frame_of.npy', frame_of[:used])
+    np.save(out / 'places.npy', places_of[:kept])
     facts = {
         'format': FORMAT,
         'version': VERSION,
@@ -112,6 +115,8 @@ def make_samples(
         'noise_deg': float(np.rad2deg(noise.rotation_rad)),
         'frames': kept,
         'samples': used,
+        'map': str(local_map.path.resolve()),
+        'camera': {'K': framing.camera.K.tolist(), 'distortion': list(framing.camera.distortion)},
     }
     (out / 'facts.json').write_text(json.dumps(facts, indent=1) + '\n')
     return used

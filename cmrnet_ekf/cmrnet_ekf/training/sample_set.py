@@ -5,6 +5,7 @@ frames.npy     [F x H x W x 3] uint8, as the network takes them
 lidar.npy      [S x H x W] uint16 depth, 65535 is max_depth
 frame_of.npy   [S] which frame belongs to each LiDAR image
 guesses.npy    [S x 4 x 4] T_camera_guess, axes forward, left, up
+places.npy     [F x 4 x 4] T_map_camera, axes forward, left, up (sets of before may lack it)
 """
 
 import json
@@ -17,8 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bags.records import CameraModel
 from cmrnet_ekf.pose_sampling import targets
 from lcd_common.errors import DataError
+from lcd_common.se3 import Array
 
 FORMAT, VERSION = 'cmrnet_samples', 1
 FULL_SCALE = 65535
@@ -67,6 +70,8 @@ class SampleSet:
         if not len(self.lidar) == len(self.frame_of) == len(self.guesses) > 0:
             raise DataError(f'{path}: its parts have different lengths; make the samples anew')
         self._targets = targets(np.asarray(self.guesses))
+        there = (path / 'places.npy').is_file()
+        self.T_map_camera: Array | None = np.load(path / 'places.npy') if there else None
 
     def __len__(self) -> int:
         return len(self.frame_of)
@@ -75,6 +80,23 @@ class SampleSet:
     def images(self) -> tuple[float, ...]:
         """Which images these are; see `CmrnetConfig.images`."""
         return tuple(self.facts['images'])
+
+    @property
+    def camera(self) -> CameraModel:
+        """Calibration of the frames.
+
+        Raises:
+            DataError: the set is of before these were kept.
+        """
+        try:
+            given = self.facts['camera']
+            K, distortion = np.array(given['K'], np.float64), tuple(given['distortion'])
+        except (KeyError, TypeError) as error:
+            raise DataError(
+                f'{self.path}: does not say what camera it is of; make the samples anew'
+            ) from error
+        height, width = self.frames.shape[1:3]
+        return CameraModel('camera', width, height, K, distortion)
 
     def batch(self, index: NDArray[np.int64]) -> Batch:
         """Return samples [B]."""

@@ -24,6 +24,7 @@ from cmrnet_ekf.training.variants import NETWORKS, VARIANTS, Variant, variant
 from lcd_common.command_line import run
 from lcd_common.errors import ConfigError
 from lcd_common.setting_changes import changed
+from lcd_loop_closure.lcdnet.device import choose_device
 
 _log = logging.getLogger(__name__)
 _EXAMPLES = """
@@ -66,7 +67,7 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.start:
         network.load_state_dict(checkpoint.load_network(arguments.start)[0].state_dict())
     trainer = Trainer(
-        network, sets, arguments.out, chosen.training, chosen.loss, _device(arguments)
+        network, sets, arguments.out, chosen.training, chosen.loss, choose_device(arguments.device)
     )
     _log.info(
         '%d parameters, %d samples, %s, from step %d',
@@ -141,19 +142,6 @@ def _judge(
         card = {**facts, 'network': asdict(chosen.network), 'sha256': digest}
         (out / 'best.json').write_text(json.dumps(card, indent=1) + '\n')
     draw_curves(out)
-
-
-def _device(arguments: argparse.Namespace) -> torch.device:
-    name = arguments.device
-    if name == 'auto':
-        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ConfigError(f'device must be auto, cpu or cuda[:N], got {name!r}') from None
-    if device.type == 'cuda' and not torch.cuda.is_available():
-        raise ConfigError(f'device {name} is not there: torch sees no CUDA device; use auto or cpu')
-    return device
 
 
 def _parser() -> argparse.ArgumentParser:

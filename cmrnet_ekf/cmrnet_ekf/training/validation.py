@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmrnet_ekf import euler
 from cmrnet_ekf.calibration import ause, calibration, sharpness
@@ -53,11 +54,10 @@ def predictions(
         batch: asked at a time.
     """
     beliefs, guesses = [], []
-    for one in sets:
-        for index in _batches(len(one), per_set or len(one), batch):
-            samples = one.batch(index)
-            beliefs.append(predictor.belief(samples.image, samples.lidar))
-            guesses.append(np.asarray(one.guesses[index]))
+    for one, index in batches(sets, per_set, batch):
+        samples = one.batch(index)
+        beliefs.append(predictor.belief(samples.image, samples.lidar))
+        guesses.append(np.asarray(one.guesses[index]))
     all_guesses = np.concatenate(guesses)
     return joined(beliefs), targets(all_guesses), all_guesses
 
@@ -79,7 +79,12 @@ def validate(
     return Validation(rough, summary(metres, radians), curves, spread, by_trace)
 
 
-def _batches(count: int, wanted: int, size: int) -> Iterator[np.ndarray]:
-    chosen = np.unique(np.linspace(0, count - 1, min(wanted, count)).astype(np.int64))
-    for begin in range(0, len(chosen), size):
-        yield chosen[begin : begin + size]
+def batches(
+    sets: Sequence[SampleSet], per_set: int | None = None, size: int = 16
+) -> Iterator[tuple[SampleSet, NDArray[np.int64]]]:
+    """Yield sets with the numbers of samples in them; arguments as for `predictions`."""
+    for one in sets:
+        wanted = min(per_set or len(one), len(one))
+        chosen = np.unique(np.linspace(0, len(one) - 1, wanted).astype(np.int64))
+        for begin in range(0, len(chosen), size):
+            yield one, chosen[begin : begin + size]

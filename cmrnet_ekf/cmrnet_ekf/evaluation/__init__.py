@@ -1,0 +1,1 @@
+"""Judge networks on samples, and filters on drives: thesis section 5.3."""
