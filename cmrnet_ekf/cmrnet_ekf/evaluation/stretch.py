@@ -92,10 +92,10 @@ def worst_stretch(
     T_map_camera = chosen.T_map_camera[chosen.frame_of[index]]
     T_map_guess = T_map_camera @ np.asarray(chosen.guesses[index])
     located = {}
-    for name, one in answers.items():
-        kept = np.ones(len(one.belief), bool)
-        if one.knows:
-            kept = accepted(traces(one.belief), SHARE)
-        T_map_found = T_map_guess @ one.belief.rows(rows).transforms
-        located[name] = Located(T_map_found[:, :2, 3], one.errors[0][rows], kept[rows])
+    for name, said in answers.items():
+        kept = np.ones(len(rows), np.bool_)
+        if said.knows:
+            kept = accepted(traces(said.belief), SHARE)[rows]
+        T_map_found = T_map_guess @ said.belief.rows(rows).transforms
+        located[name] = Located(T_map_found[:, :2, 3], said.errors[0][rows], kept)
     return Stretch(str(chosen.facts['drive']), T_map_camera[:, :2, 3], located)

@@ -1,0 +1,151 @@
+"""Track a drive by networks and the thesis's filter: the command `track_cmrnet`."""
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from bags.input_arguments import add_input, add_span, drive_from
+from bags.inputs import span_ns
+from bags.records import Drive
+from cmrnet_ekf.evaluation.evaluate import RESULTS, results_folder
+from cmrnet_ekf.evaluation.named_networks import named_predictors
+from cmrnet_ekf.evaluation.tracking import Track, TrackingConfig
+from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive, record
+from cmrnet_ekf.evaluation.tracking_study import draw, figures_of, markdown, tracks, ways
+from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig
+from cmrnet_ekf.mapping.settings import MapConfig
+from cmrnet_ekf.networks.config import CmrnetConfig
+from lcd_common.command_line import run
+from lcd_common.errors import ConfigError, DataError
+from lcd_common.setting_changes import changed
+from lcd_common.trajectory import read_tum
+from lcd_loop_closure.lcdnet.device import choose_device
+
+_EXAMPLES = """
+examples:
+  track_cmrnet drive.mcap --map map --networks mcd=runs/mcd der=runs/der --out tracked
+  track_cmrnet towns:200 --length 1200 --map maps/town_200 --networks cmrnet=runs/plain0 \\
+      de=runs/plain0,runs/plain1,runs/plain2 der=runs/der --runs 20 --out tracked
+  track_cmrnet KITTI --sequence 00 --map maps/00 --networks der=runs/der --out tracked \\
+      --set start_translation=1 speed_scale=0.02
+
+towns:N is a simulated town, mapped (into --map, if that is not there yet) on one run and driven on
+another. Each run starts at a wrong pose and has no satellites. The motion model gets the
+gyroscope's turns and wheels that err (--set); the camera is asked from what the filter predicts.
+Rows: the motion model alone; corrected by a plain network without a filter; the thesis's EKF with
+each network that says how sure it is. Written are results.json, results.md, heat.png and
+tracks.npz; the images, as the networks take them, are kept in --frames and used again.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    arguments = _parser().parse_args(argv)
+    return run(lambda: _track(arguments))
+
+
+def _track(arguments: argparse.Namespace) -> None:
+    out = results_folder(arguments.out)
+    device = choose_device(arguments.device)
+    networks = named_predictors(arguments.networks, device)
+    settings = changed(TrackingConfig(), arguments.set)
+    first = next(iter(networks.values())).settings
+    drive = _recorded(arguments, first)
+    local_map = LocalMap(arguments.map, LocalMapConfig(kept_tiles=2000))
+    chosen = ways({name: [predictor] for name, predictor in networks.items()})
+    runs = dict.fromkeys(chosen, arguments.runs)
+    found: dict[str, list[Track]] = defaultdict(list)
+    total = sum(runs.values()) * (len(drive) - 1)
+    with tqdm(total=total, unit='image', disable=arguments.quiet) as bar:
+        for name, one in tracks(drive, local_map, chosen, runs, settings, bar.update):
+            found[name].append(one)
+    figures = {name: figures_of(of_way) for name, of_way in found.items()}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / RESULTS).write_text(json.dumps({'drive': drive.name, 'ways': figures}, indent=1) + '\n')
+    about = (
+        f'{drive.name}: {len(drive)} images over {drive.length_m:.0f} m; turns by {drive.turned_by}'
+    )
+    text = markdown(figures, about)
+    draw(drive, found, out / 'heat.png')
+    (out / 'results.md').write_text(f'# Tracking\n\n{text}\n![heat map](heat.png)\n')
+    write_tracks(found, out / 'tracks.npz')
+    sys.stdout.write(text)
+    sys.stdout.write(f'written to {out}: {RESULTS}, results.md, heat.png, tracks.npz\n')
+
+
+def write_tracks(found: dict[str, list[Track]], path: Path) -> None:
+    """Write WAY_SEED_pose [F x 4 x 4], and the errors of the camera's observations."""
+    arrays = {}
+    for name, of_way in found.items():
+        for one in of_way:
+            arrays[f'{name}_{one.seed}_pose'] = one.T_map_base
+            arrays[f'{name}_{one.seed}_xi'] = one.xi
+            arrays[f'{name}_{one.seed}_covariance'] = one.covariances
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def _recorded(arguments: argparse.Namespace, network: CmrnetConfig) -> TrackingDrive:
+    folder = arguments.frames or arguments.out.with_name(arguments.out.name + '_frames')
+    drive = _drive(arguments)
+    poses = read_tum(arguments.poses) if arguments.poses else drive.truth()
+    if poses is None:
+        raise DataError(f'{arguments.input}: has no ground truth; give --poses FILE.tum')
+    span = span_ns(drive, arguments.start, arguments.duration)
+    with tqdm(unit='image', desc='frames', disable=arguments.quiet) as bar:
+        recorded = record(folder, drive, poses, network, span, bar.update)
+    if recorded.name != drive.name or recorded.images != tuple(network.images):
+        raise DataError(f'{folder}: frames of another drive or network; name another folder')
+    return recorded
+
+
+def _drive(arguments: argparse.Namespace) -> Drive:
+    kind, _, number = arguments.input.partition(':')
+    if kind != 'towns':
+        return drive_from(arguments)
+    if not number.isdecimal():
+        raise ConfigError(f'expected towns:N, got {arguments.input}')
+    from cmrnet_ekf.training.towns import map_town, seen_town
+
+    town = int(number)
+    map_town(arguments.map, town, arguments.length, MapConfig(), 2, arguments.quiet)
+    return seen_town(town, arguments.length, imu='rt3003')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='track_cmrnet',
+        description="Track a drive in closed loop: CMRNet's networks and the thesis's EKF.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_input(parser)
+    add_span(parser)
+    add = parser.add_argument
+    add('--map', type=Path, required=True, help='LiDAR map of where it goes (build_lidar_map)')
+    add('--networks', nargs='+', required=True, metavar='NAME=PATH[,PATH]',
+        help='weights, or folders of train_cmrnet; several are an ensemble')  # fmt: skip
+    add('--out', type=Path, required=True, help='folder for the results')
+    add('--frames', type=Path, help='folder that keeps the images (default: OUT_frames)')
+    add('--poses', type=Path, metavar='TUM', help='poses of base_link (default: ground truth)')
+    add('--length', type=float, default=1200.0, metavar='M', help='of a town (default: 1200)')
+    add('--runs', type=_count, default=3, help='of each way, seeds 0, 1, ... (default: 3)')
+    add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of starts and wheels')
+    add('--device', default='auto', help='auto, cpu, cuda, cuda:1 ... (default: auto)')
+    add('--quiet', action='store_true', help='no progress bars')
+    return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'{text} is no number of at least 1')
+    return int(text)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
