@@ -25,7 +25,7 @@ def circuit() -> StreetDrive:
 def evaluate(work: Path, recorded_s: float = 3600.0) -> dict[str, Any]:
     """Replay laps in lock-step until `recorded_s` of recorded time have passed.
 
-    Returns memory per keyframe (fitted to the process's resident size over the second half), what
+    Returns memory per keyframe (fitted to the processes' resident size over the second half), what
     grows beside the map, and the keyframes and memory at the end.
     """
     from bags.drives import open_drive
@@ -74,5 +74,8 @@ def evaluate(work: Path, recorded_s: float = 3600.0) -> dict[str, Any]:
 
 
 def _resident_bytes() -> int:
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * 4096
+    """Return the memory of this process and of its children: loops are looked for in one."""
+    tasks = Path('/proc/self/task').iterdir()
+    children = [pid for task in tasks for pid in (task / 'children').read_text().split()]
+    statm = (Path('/proc') / pid / 'statm' for pid in ('self', *children))
+    return sum(4096 * int(path.read_text().split()[1]) for path in statm)

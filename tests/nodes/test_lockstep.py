@@ -173,6 +173,34 @@ def test_a_drive_gives_time_transforms_and_timers(nodes: list[Node], drive: Stre
     assert node.ticks == [first + 1_000_000_000 + 500_000_000 * i for i in range(1, 5)]
 
 
+class Late(Echo):
+    """Hold every answer back until it is flushed."""
+
+    def __init__(self, **options: object) -> None:
+        super().__init__('late', **options)
+        self.held: list[str] = []
+        self.create_subscription(PointCloud2, 'points', self.on_points, 10)
+
+    def on_points(self, message: PointCloud2) -> None:
+        self.held.append('x')
+
+    def flush(self) -> None:
+        self.out.publish(String(data=''.join(self.held)))
+        self.held.clear()
+
+
+def test_what_nodes_hold_back_is_delivered_at_the_end(
+    nodes: list[Node], drive: StreetDrive
+) -> None:
+    echo = Echo(cli_args=['--ros-args', '-r', 'in:=out', '-r', 'out:=last'])
+    nodes += [Late(), echo]
+    lockstep = LockStep(nodes)
+    lockstep.run(drive, duration_s=0.2, progress=False)
+    assert echo.seen == ['xxx']
+    lockstep.flush()
+    assert echo.seen == ['xxx', '']
+
+
 def test_two_runs_give_identical_bytes(drive: StreetDrive) -> None:
     runs = []
     for _ in range(2):

@@ -3,11 +3,14 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bags.records import Record
 from bags.street import StreetConfig, StreetDrive
 from bags.street.lidar import LidarConfig
 from lcd_common.errors import ConfigError
@@ -93,6 +96,32 @@ def test_parameter_files_reach_the_nodes(tmp_path: Path) -> None:
     file.write_text('/loop_closure:\n  ros__parameters:\n    keyframes:\n      distance: -1.0\n')
     with pytest.raises(ConfigError, match='distance'):
         drive_through(street(), source='', parameter_files=[file], progress=False)
+
+
+class Interrupted(StreetDrive):
+    """A street on which somebody presses Ctrl-C after three seconds."""
+
+    def records(self, *given: Any, **options: Any) -> Iterator[Record]:
+        first = self.streams()[0].first_ns
+        assert first is not None
+        for record in super().records(*given, **options):
+            if record.stamp_ns > first + 3_000_000_000:
+                raise KeyboardInterrupt
+            yield record
+
+
+@pytest.mark.parametrize('threads', [0, 1])
+def test_an_interrupted_drive_keeps_all_that_was_driven(threads: int) -> None:
+    from lcd_loop_closure.nodes.offline_slam import drive_through
+
+    drive = Interrupted('loop', street().settings, LidarConfig(columns=240, rate=5.0))
+    options: dict[str, Any] = {'source': '', 'detector': 'scan_context', 'progress': False}
+    result = drive_through(drive, threads=threads, **options)
+    assert result.interrupted and len(result.odometry) == 16
+    # The last keyframe is there too: nothing was left in the process beside.
+    travelled = np.linalg.norm(result.odometry.positions[-1] - result.keyframes.positions[-1])
+    assert len(result.keyframes) >= 8 and travelled < 3.0
+    assert [*result.counts] == ['/lidar_odometry', '/loop_closure', '/pose_graph']
 
 
 def test_nothing_of_the_environment_is_left_changed() -> None:

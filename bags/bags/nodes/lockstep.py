@@ -35,7 +35,8 @@ class LockStep:
     Messages are handed over as they are, not copied: neither side may change them afterwards.
 
     The nodes get `use_sim_time`: their clock is the stamp of the record in hand, and their timers
-    fire by it. A node with a parameter `threaded` must have it false.
+    fire by it. A node with a parameter `threaded` must have it false. A node may have a method
+    `flush` that publishes what it holds back; it is called when the replay ends.
     """
 
     def __init__(self, nodes: Sequence[Node], *, fire_timers: bool = True) -> None:
@@ -147,7 +148,15 @@ class LockStep:
                     self.feed(found.topic, decode(found.data, found.type_name))
                     fed[found.topic] += 1
                 bar.update(found.topic == '/points')
+        self.flush()
         return fed
+
+    def flush(self) -> None:
+        """Have the nodes publish what they hold back, and deliver it; `run` ends with this."""
+        for node in self.nodes:
+            if hasattr(node, 'flush'):
+                node.flush()
+                self._drain()
 
     def _messages(self, drive: Drive, begin_ns: int, end_ns: int | None) -> Iterator[BagBytes]:
         if drive.mountings:

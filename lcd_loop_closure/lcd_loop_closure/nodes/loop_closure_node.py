@@ -12,13 +12,15 @@ Services    ~/load_map (lcd_msgs/LoadMap): look for loops with a saved map, and 
 
 Clouds wait for the odometry at their stamp. Keyframes are published at once; the search for loops
 runs beside, and when it cannot keep up, the oldest waiting keyframe is not searched (it stays a
-candidate for later ones). With gate.use a keyframe waits for what place recognition says of its
-scan; one that it rejects is not registered with candidates by descriptor. Parameters: see
+candidate for later ones). In lock-step replay all of it happens inside the callbacks, or with
+`beside` in a process of its own. With gate.use a keyframe waits for what place recognition says of
+its scan; one that it rejects is not registered with candidates by descriptor. Parameters: see
 config/loop_closure.yaml or `ros2 param describe`.
 """
 
 import os
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +30,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
 from lcd_common import se3
-from lcd_common.errors import DataError, MapError
+from lcd_common.errors import ConfigError, DataError, MapError
 from lcd_common.nodes import messages, qos
 from lcd_common.nodes.diagnostics import Diagnostics
 from lcd_common.nodes.parameters import declare_config
@@ -37,7 +39,8 @@ from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.nodes.worker import Worker
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
-from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
+from lcd_loop_closure.keyframes import Keyframe, KeyframeConfig, KeyframeSelector
+from lcd_loop_closure.loop import LoopConstraint
 from lcd_loop_closure.loop_detector import LoopDetectorSettings
 from lcd_loop_closure.loop_search import LoopSearch, SearchJob, Session
 from lcd_loop_closure.map_store import load_map
@@ -49,10 +52,14 @@ from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
 from lcd_loop_closure.place_gate import PlaceGate, PlaceGateConfig, PlaceVerdict
 from lcd_loop_closure.radius_search import GraphPositions
+from lcd_loop_closure.search_process import Found, SearchProcess, Sweep
 from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
 from lcd_msgs.msg import PlaceMatchArray
 from lcd_msgs.srv import LoadMap
+
+# A vehicle that stands makes no next keyframe: the last one must not wait for it.
+_LONGEST_BESIDE_NS = 1_000_000_000
 
 
 @config
@@ -73,6 +80,11 @@ class LoopClosureNodeConfig:
         10, 'lower priority of the process when it runs alone: odometry goes first', low=0, high=19
     )
     threaded: bool = setting(True, 'work beside the callbacks; false: inside, for lock-step replay')
+    beside: bool = setting(
+        False,
+        'with threaded false: describe and search in a process of its own, and publish what it '
+        'found with the next keyframe; not with gate.use',
+    )
 
 
 @dataclass(frozen=True)
@@ -96,14 +108,20 @@ class LoopClosureNode(Node):
         detector = declare_groups(self, LoopDetectorSettings())
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
-        self._search = LoopSearch(detector, self.diagnostics.stage)
+        self._search = None if self.config.beside else LoopSearch(detector, self.diagnostics.stage)
         self._buffer: StampBuffer[PointCloud2] = StampBuffer(
             self.config.waiting_clouds, round(self.config.max_odometry_gap * 1e9)
         )
         self._gate: PlaceGate[SearchJob] = PlaceGate(
             declare_config(self, PlaceGateConfig, 'gate'), self._search_gated
         )
+        if self.config.beside and (self.config.threaded or self._gate.settings.use):
+            raise ConfigError(
+                'beside is for lock-step replay without place recognition: it needs threaded false '
+                'and gate.use false (an offline drive with one thread does without beside)'
+            )
         self._graph: GraphPositions | None = None
+        self._remembered = 0
         self._unsearched: deque[SearchJob] = deque()
         self._frames = ('odom', 'base_link')
         self._session = Session()
@@ -139,7 +157,10 @@ class LoopClosureNode(Node):
         self.create_service(Trigger, '~/reset', self.on_reset)
         self.diagnostics.watch('clouds waiting for odometry', lambda: len(self._buffer))
         self.diagnostics.watch('keyframes waiting for the search', self._searches.waiting)
-        self.diagnostics.watch('keyframes remembered', lambda: self._search.size)
+        self.diagnostics.watch('keyframes remembered', lambda: self._remembered)
+        # The last one, as nobody would end the process of a node that was not made.
+        self._beside = SearchProcess(detector) if self.config.beside else None
+        self._under_way: _Scan | None = None
 
     def on_points(self, message: PointCloud2) -> None:
         """Let a cloud wait for its odometry."""
@@ -160,6 +181,9 @@ class LoopClosureNode(Node):
             self._frames = (message.header.frame_id, message.child_frame_id or 'base_link')
             self._choose(self._buffer.add_pose(pose))
             self._gate.time(pose.stamp_ns)
+            last = self._under_way
+            if last is not None and pose.stamp_ns - last.pose.stamp_ns > _LONGEST_BESIDE_NS:
+                self.flush()
 
     def on_graph_keyframes(self, message: PointCloud2) -> None:
         """Remember where the pose graph has the keyframes, for the radius search."""
@@ -194,10 +218,34 @@ class LoopClosureNode(Node):
         response.success, response.message = True, 'loop closure starts again'
         return response
 
+    def flush(self) -> None:
+        """Publish what the process beside has found, when it is done; nothing is held back then.
+
+        Raises:
+            SearchProcessError: the process ended, and the keyframes are lost.
+        """
+        scan = self._under_way
+        if self._beside is None or scan is None:
+            return
+        with self.diagnostics.stage('wait'):
+            found = self._beside.result()
+        self._under_way = None
+        if found is None:
+            return  # Ctrl-C cut the connection
+        for stage, seconds in found.times:
+            self.diagnostics.time(stage, seconds)
+        self._remembered = found.size
+        if scan.session is self._session:
+            self._publish_found(scan, found)
+        else:
+            self.diagnostics.count('dropped keyframes: their session ended')
+
     def destroy_node(self) -> None:
-        """Stop the workers, then the node."""
+        """Stop the workers and the process, then the node."""
         self._scans.stop()
         self._searches.stop()
+        if self._beside is not None:
+            self._beside.close()
         super().destroy_node()
 
     def _restart(self, stamp_ns: int) -> None:
@@ -236,6 +284,7 @@ class LoopClosureNode(Node):
         self.diagnostics.error('transform', problem)
         if T_base_lidar is not None:
             self._selector.take(pose.T_odom_base)
+            self.flush()
             self._scans.put(_Scan(self._session, pose, points, T_base_lidar, self._frames))
 
     def _make_keyframe(self, scan: _Scan) -> None:
@@ -246,24 +295,48 @@ class LoopClosureNode(Node):
         except DataError as error:
             self._reject('points', 'broken', str(error))
             return
+        cloud, origin = cloud.transformed(scan.T_base_lidar), scan.T_base_lidar[:3, 3]
+        if self._beside is not None:
+            self._under_way = scan
+            self._beside.hand_over(scan.session, Sweep(scan.pose, cloud, origin, self._graph))
+            return
+        assert self._search is not None
         try:
-            keyframe = self._search.keyframe(
-                scan.session, scan.pose, cloud.transformed(scan.T_base_lidar)
-            )
+            keyframe = self._search.keyframe(scan.session, scan.pose, cloud)
         except DataError as error:
             self._reject('points', 'too few', str(error))
             return
         if keyframe is None:
             self._reject('points', 'empty', 'a cloud has no points in range')
             return
-        self._keyframes_out.publish(keyframe_message(keyframe, *scan.frames))
-        self.diagnostics.tick('keyframe', keyframe.stamp_ns)
-        origin = scan.T_base_lidar[:3, 3]
+        self._publish_keyframe(keyframe, scan)
         job = SearchJob(scan.session, keyframe, origin, None)
         if self._gate.settings.use:
             self._gate.hold(keyframe.stamp_ns, job)
         else:
             self._searches.put(job)
+
+    def _publish_found(self, scan: _Scan, found: Found) -> None:
+        if found.keyframe is not None:
+            self._publish_keyframe(found.keyframe, scan)
+        if found.failed:
+            what = 'keyframes' if found.keyframe is None else 'loop search'
+            self._reject(what, 'failed', found.failed)
+        elif found.refused:
+            self._reject('points', 'too few', found.refused)
+        elif found.keyframe is None:
+            self._reject('points', 'empty', 'a cloud has no points in range')
+        self._publish_loops(found.loops, scan.session)
+
+    def _publish_keyframe(self, keyframe: Keyframe, scan: _Scan) -> None:
+        self._keyframes_out.publish(keyframe_message(keyframe, *scan.frames))
+        self.diagnostics.tick('keyframe', keyframe.stamp_ns)
+
+    def _publish_loops(self, loops: Iterable[LoopConstraint], session: Session) -> None:
+        for loop in loops:
+            self.diagnostics.count(f'loops {loop.status.name.lower()}')
+            if session is self._session:
+                self._loops_out.publish(loop_message(loop, self._frames[1]))
 
     def _search_gated(self, job: SearchJob, verdict: PlaceVerdict | None) -> None:
         if verdict is None:
@@ -280,16 +353,15 @@ class LoopClosureNode(Node):
     def _find_loops(self, job: SearchJob) -> None:
         if job.session is not self._session:
             return
+        assert self._search is not None
         while self._unsearched:
             skipped = self._unsearched.popleft()
             if skipped.session is job.session:
                 self._search.run(skipped)
         with self.diagnostics.stage('search'):
             loops = self._search.run(replace(job, graph=self._graph))
-        for loop in loops:
-            self.diagnostics.count(f'loops {loop.status.name.lower()}')
-            if job.session is self._session:
-                self._loops_out.publish(loop_message(loop, self._frames[1]))
+        self._remembered = self._search.size
+        self._publish_loops(loops, job.session)
 
     def _worker(self, name: str, work: Any, capacity: int, on_drop: Any) -> Worker[Any]:
         def dropped(item: Any) -> None:

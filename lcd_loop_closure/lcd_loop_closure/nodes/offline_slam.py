@@ -50,7 +50,8 @@ class OfflineSlam:
         Args:
             context: that they live in.
             parameter_files: ROS parameter files; what lock-step needs holds above them.
-            threads: of registration, 0 is all cores; None is what the parameter files say.
+            threads: of registration, 0 is all cores; None is what the parameter files say. But for
+                one thread, loops are looked for in a process beside.
             detector: what describes places; None is what the parameter files say.
 
         Raises:
@@ -69,8 +70,11 @@ class OfflineSlam:
 
         given = {} if threads is None else {'threads': threads}
         self.odometry = LidarOdometryNode(**options(**given))
-        chosen: dict[str, object] = {} if detector is None else {'descriptor__method': detector}
-        if threads is not None:
+        beside = self.odometry.get_parameter('threads').value != 1
+        chosen: dict[str, object] = {'beside': beside}
+        if detector is not None:
+            chosen['descriptor__method'] = detector
+        if threads is not None and not beside:
             chosen['lcdnet__threads'] = threads
         self.loop_closure = LoopClosureNode(**options(**chosen))
         self.pose_graph = PoseGraphNode(**options())
@@ -98,6 +102,7 @@ class OfflineSlam:
             self.lockstep.run(drive, start_s=start_s, duration_s=duration_s, progress=progress)
         except KeyboardInterrupt:
             interrupted = True
+            self.lockstep.flush()
         self.pose_graph.show(map_cloud=True)
         if self._scan_stamps:
             for second in range(1, _AFTERWARDS_S + 1):

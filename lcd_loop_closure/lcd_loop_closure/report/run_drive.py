@@ -151,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--params', type=Path, action='append', default=[], metavar='YAML',
         help='ROS parameter file for the nodes (repeatable)')  # fmt: skip
     add('--threads', type=_count, metavar='N',
-        help='threads of registration; 1 repeats exactly, 0: all cores (default)')  # fmt: skip
+        help='threads of registration; 1 repeats exactly, in one process; 0: all')  # fmt: skip
     add('--detector', choices=('lcdnet', 'scan_context'),
         help='what finds loops by their looks (default: lcdnet)')  # fmt: skip
     add('--start', type=_seconds, default=0.0, metavar='S', help='leave out the first S seconds')
