@@ -25,6 +25,7 @@ from lcd_common import se3
 POINTS = 700_000
 FILL = 0.25
 _SAMPLES = 30
+_STEP = 0.08  # between points of a surface, metres: as a map of voxels of 0.1 m has them
 T_BASE_CAMERA = CAMERA.T_parent_child
 
 
@@ -102,7 +103,7 @@ def _steps() -> None:
 
 
 def street(points: int = POINTS, fill: float = FILL) -> NDArray[np.float32]:
-    """Return a street, base frame: road, two rows of houses, poles; as a voxel map of 0.1 m.
+    """Return a street, base frame: road, two rows of houses, parked cars.
 
     Of the surfaces ahead so many points are taken that the image (before the occlusion filter) is
     filled by about `fill`; the rest lies behind the camera.
@@ -128,14 +129,14 @@ def street(points: int = POINTS, fill: float = FILL) -> NDArray[np.float32]:
 
 
 def _surfaces(rng: np.random.Generator, near: float, far: float) -> NDArray[np.float64]:
-    x = np.arange(near, far, 0.1)
-    parts = [_grid(x, np.arange(-12.0, 12.0, 0.1), (0, 1, 2), 0.0)]
-    parts += [_grid(x, np.arange(0.0, 8.0, 0.1), (0, 2, 1), side) for side in (-12.0, 12.0)]
+    x = np.arange(near, far, _STEP)
+    parts = [_grid(x, np.arange(-12.0, 12.0, _STEP), (0, 1, 2), 0.0)]
+    parts += [_grid(x, np.arange(0.0, 8.0, _STEP), (0, 2, 1), side) for side in (-12.0, 12.0)]
     for at in np.arange(near + 3.0, far, 9.0):
         for side in (-6.0, 6.0):  # a parked car: side and top
-            along = np.arange(at, min(at + 4.0, far), 0.1)
-            parts.append(_grid(along, np.arange(0.2, 1.4, 0.1), (0, 2, 1), side))
-            parts.append(_grid(along, side + np.arange(-0.8, 0.8, 0.1), (0, 1, 2), 1.4))
+            along = np.arange(at, min(at + 4.0, far), _STEP)
+            parts.append(_grid(along, np.arange(0.2, 1.4, _STEP), (0, 2, 1), side))
+            parts.append(_grid(along, side + np.arange(-0.8, 0.8, _STEP), (0, 1, 2), 1.4))
     whole = np.concatenate(parts)
     return whole + rng.uniform(-0.05, 0.05, whole.shape)
 

@@ -48,6 +48,8 @@ class StreetWithCamera:
 
     def records(self, start_ns=None, end_ns=None, kinds: Collection = ()) -> Iterator[CameraImage]:
         for index, stamp_ns in enumerate(self.stamps_ns):
+            if kinds and CameraImage not in kinds:
+                return
             if (start_ns or 0) <= stamp_ns <= (end_ns or 10**18):
                 yield self.image(index)
 

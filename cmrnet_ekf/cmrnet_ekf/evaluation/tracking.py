@@ -157,9 +157,7 @@ def _observation(
     points, origin = local_map.around(T_map_guess)
     if not len(points):
         return None
-    estimate = localizer.locate_framed(
-        np.ascontiguousarray(framed), points, near_origin(T_map_guess, origin)
-    )
+    estimate = localizer.locate_framed(np.array(framed), points, near_origin(T_map_guess, origin))
     if estimate.fill < s.least_fill:
         return None
     return near_origin(estimate.T_map_base, -origin), estimate.covariance

@@ -98,15 +98,15 @@ def draw(drive: TrackingDrive, found: Mapping[str, Sequence[Track]], path: Path)
     rows = -(-len(found) // columns)
     place = drive.T_map_base[1:, :2, 3]
     with figure(path, (4.0 * columns + 0.8, 3.8 * rows)) as canvas:
-        axes = canvas.subplots(rows, columns, squeeze=False)
-        shown = None
-        for ax, (name, of_way) in zip(axes.ravel(), found.items(), strict=False):
+        every = list(canvas.subplots(rows, columns, squeeze=False).ravel())
+        axes, shown = every[: len(found)], None
+        for ax, (name, of_way) in zip(axes, found.items(), strict=True):
             first = of_way[0]
             shown = ax.scatter(*place.T, c=first.metres, s=7, cmap='inferno_r', vmin=0, vmax=_HOT_M)
             ax.set_aspect('equal', 'datalim')
             ax.set_title(f'{name}: median {np.median(first.metres):.2f} m')
             ax.set(xlabel='x [m]', ylabel='y [m]')
-        for ax in axes.ravel()[len(found) :]:
+        for ax in every[len(found) :]:
             ax.remove()
         if shown is not None:
             canvas.colorbar(shown, ax=axes, label='translation error [m]', extend='max')

@@ -1,0 +1,141 @@
+"""How the sections of benchmarks.cmrnet_ekf are put together, on answers that are made up."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bags.simulation.car import camera_model
+from benchmarks import (
+    cmrnet_ekf,
+    cmrnet_methods,
+    cmrnet_sets,
+    cmrnet_speed,
+    cmrnet_tracking,
+    report,
+)
+from cmrnet_ekf.evaluation.study import Study
+from cmrnet_ekf.lidar_image.imager import LidarImager
+from cmrnet_ekf.lidar_image.settings import LidarImageConfig
+from cmrnet_ekf.localization_errors import summary
+from cmrnet_ekf.networks.checkpoint import save_network
+from cmrnet_ekf.networks.cmrnet import Cmrnet
+from lcd_common import se3
+from lcd_common.errors import DataError
+
+sys.path.append(str(Path(__file__).parents[1] / 'cmrnet_ekf'))
+from evaluation_cases import known_answers, perfect_answers
+from small_samples import SMALL, StreetWithCamera, street_map
+
+METHODS = ('localization', 'calibration', 'rejection')
+
+
+@pytest.fixture
+def made(monkeypatch):
+    rough = summary(np.full(400, 1.8), np.full(400, 0.17))
+    answers = {
+        'cmrnet': perfect_answers(400),
+        'mcd': known_answers(400, told=0.5, kind='made'),
+        'de': known_answers(400, seed=2, kind='made'),
+        'der': known_answers(400, freedom=4.0, seed=3),
+    }
+    found = Study(('made_up',), rough, answers)
+    monkeypatch.setattr(cmrnet_methods, 'judged', lambda work, quick: found)
+    return found
+
+
+def figures_of(sections, work):
+    figures = {}
+    for name in sections:
+        section = cmrnet_ekf.sections(quick=True)[name][1]
+        figures = dict(cmrnet_ekf.place(figures, name, section(work)))
+    return figures
+
+
+def test_required_figures_are_found_where_sections_put_them(made, tmp_path):
+    figures = figures_of(METHODS, tmp_path)
+    absent = report.missing(figures, cmrnet_ekf.REQUIRED)
+    assert not [key for key in absent if key.split('.')[0] in METHODS]
+    assert figures['localization']['rough']['t_median_m'] == pytest.approx(1.8)
+    assert figures['localization']['cmrnet']['t_mean_m'] < 1e-9
+    assert figures['calibration']['mcd']['x'] == pytest.approx(0.209, abs=0.03)
+    assert figures['calibration']['der']['x'] < 0.06
+    assert 0.15 <= figures['rejection']['de']['discarded_share'] < 0.28
+    holds = figures['localization']['relations']
+    assert holds['most_accurate'] == 'cmrnet' and not holds['de_is_most_accurate']
+    assert holds['rejection_lowers_t_mean'] == {'de': True, 'der': True}
+    assert (tmp_path / 'pictures' / 'cmrnet' / 'calibration.png').is_file()
+    assert 'made_up' in (tmp_path / 'pictures' / 'cmrnet' / 'results.md').read_text()
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    """Untrained networks in all the forms that a role may have."""
+    folder = tmp_path / 'weights'
+    torch.manual_seed(0)
+    from dataclasses import replace
+
+    save_network(folder / 'cmrnet.safetensors', Cmrnet(SMALL), {})
+    save_network(folder / 'mcd' / 'best.safetensors', Cmrnet(replace(SMALL, dropout=0.3)), {})
+    save_network(folder / 'mcd' / 'checkpoint.safetensors', Cmrnet(SMALL), {})
+    for seed in range(2):
+        save_network(folder / 'de' / f'seed{seed}' / 'best.safetensors', Cmrnet(SMALL), {})
+    evidential = Cmrnet(replace(SMALL, head='evidential'))
+    save_network(folder / 'der' / 'best.safetensors', evidential, {})
+    save_network(folder / 'second' / 'der.safetensors', evidential, {})
+    monkeypatch.setenv('CMRNET_WEIGHTS', str(folder))
+    return folder
+
+
+def test_weights_are_found_by_role(weights):
+    found = cmrnet_sets.predictors()
+    assert {role: one.kind for role, one in found.items()} == {
+        'cmrnet': 'plain', 'mcd': 'mcd', 'de': 'de', 'der': 'der',
+    }  # fmt: skip
+    assert list(cmrnet_sets.predictors('second')) == ['der']
+    assert cmrnet_sets.predictors('third') == {}
+    (weights / 'cmrnet.safetensors').unlink()
+    with pytest.raises(DataError, match='cmrnet is missing'):
+        cmrnet_sets.predictors()
+
+
+def test_without_weights_a_section_says_so(monkeypatch, tmp_path):
+    monkeypatch.delenv('CMRNET_WEIGHTS', raising=False)
+    for name in (*METHODS, 'ekf'):
+        with pytest.raises(DataError, match='set CMRNET_WEIGHTS'):
+            cmrnet_ekf.sections(quick=True)[name][1](tmp_path)
+
+
+def test_the_closed_loop_has_its_required_figures(weights, monkeypatch, tmp_path):
+    street = StreetWithCamera()
+    street_map(tmp_path / 'map')
+
+    def town_map(work, town, length_m):
+        from cmrnet_ekf.mapping.local_map import LocalMap
+
+        return LocalMap(tmp_path / 'map')
+
+    monkeypatch.setattr(cmrnet_sets, 'town_map', town_map)
+    monkeypatch.setattr(cmrnet_sets, 'seen_town', lambda town, length_m, imu: street)
+    figures = figures_of(['ekf'], tmp_path)
+    absent = report.missing(figures, cmrnet_ekf.REQUIRED)
+    assert not [key for key in absent if key.startswith('ekf.')]
+    assert figures['ekf']['conditions']['images'] == 10
+    assert list(figures['ekf']['refined']) == ['motion', 'der']
+    assert cmrnet_tracking.RUNS_DER >= 20 and cmrnet_sets.TRACKED_M >= 1000.0
+    assert (tmp_path / 'pictures' / 'cmrnet' / 'heat.png').is_file()
+
+
+def test_towns_are_of_the_test_split():
+    towns = (*cmrnet_sets.TOWNS, cmrnet_sets.TRACKED_TOWN)
+    assert all(200 <= town < 210 for town in towns) and len(set(towns)) == len(towns)
+
+
+def test_the_street_that_is_timed_has_the_size_and_fill_that_are_told():
+    points = cmrnet_speed.street()
+    assert points.shape == (700_000, 3) and points.dtype == np.float32
+    imager = LidarImager(camera_model(), LidarImageConfig(radius=0))
+    image = imager.image(points, se3.inverse(cmrnet_speed.T_BASE_CAMERA))
+    assert float((image > 0).float().mean()) == pytest.approx(0.25, abs=0.005)

@@ -1,0 +1,243 @@
+"""Track a made-up street by predictors that know the answer."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_samples import CAMERA, SMALL, T_BASE_CAMERA, StreetWithCamera, street_map
+
+from bags.records import ImuSample, Mounting
+from cmrnet_ekf import euler
+from cmrnet_ekf.evaluation import track as command
+from cmrnet_ekf.evaluation.tracking import Track, TrackingConfig, component_covariance, track
+from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive, record
+from cmrnet_ekf.evaluation.tracking_study import figures_of, ways
+from cmrnet_ekf.networks.checkpoint import save_network
+from cmrnet_ekf.networks.cmrnet import Cmrnet
+from cmrnet_ekf.pose_belief import PoseBelief
+from cmrnet_ekf.pose_sampling import T_OPTICAL_BODY
+from cmrnet_ekf.predictors import Predictor
+from cmrnet_ekf.thesis_ekf import pose_matrix, pose_vector
+from lcd_common import se3
+from lcd_common.errors import ConfigError, DataError
+from lcd_common.trajectory import Trajectory
+
+EXACT = TrackingConfig(speed_scale=0.0, speed_noise=0.0)
+
+
+class BendWithImu(StreetWithCamera):
+    """The same images along a bend of constant turn rate, with a gyroscope that tells it."""
+
+    name, turn_rate = 'bend', 0.2
+    mountings = (
+        *StreetWithCamera.mountings,
+        Mounting('base_link', 'imu', np.diag([1.0, -1, -1, 1])),
+    )
+
+    def truth(self) -> Trajectory:
+        yaw = self.turn_rate * np.arange(10) * 0.1
+        radius = 15.0 / self.turn_rate
+        T = np.array([se3.rotation_z(float(y)) for y in yaw])
+        T[:, 0, 3], T[:, 1, 3] = radius * np.sin(yaw), radius * (1 - np.cos(yaw))
+        return Trajectory(self.stamps_ns, T)
+
+    def records(self, start_ns=None, end_ns=None, kinds=()):
+        if ImuSample not in kinds:
+            yield from super().records(start_ns, end_ns, kinds)
+            return
+        for stamp_ns in range(start_ns, end_ns + 1, 10**7):
+            # The sensor hangs upside down.
+            yield ImuSample(stamp_ns, np.array([0.0, 0, -self.turn_rate]), np.zeros(3))
+
+
+class Oracle(Predictor):
+    """Knows where each image was taken, and tells it with errors of its own deviations."""
+
+    def __init__(self, drive: TrackingDrive, scale: np.ndarray, seed: int = 0) -> None:
+        super().__init__([Cmrnet(replace(SMALL, head='evidential'))])
+        self.drive, self.scale, self.rng = drive, scale, np.random.default_rng(seed)
+        self.T_map_looked = np.eye(4)
+
+    def belief(self, image, lidar):
+        pixels = image[0].permute(1, 2, 0).numpy()
+        number = next(k for k, frame in enumerate(self.drive.frames) if (frame == pixels).all())
+        T_body = self.drive.T_map_base[number] @ T_BASE_CAMERA @ T_OPTICAL_BODY
+        mean = euler.components(se3.inverse(self.T_map_looked) @ T_body)
+        mean = mean - self.rng.normal(size=6) * self.scale
+        infinite = np.full((1, 6), np.inf)
+        return PoseBelief(mean[None], self.scale[None], infinite, np.square(self.scale)[None])
+
+
+@pytest.fixture
+def oracle(tmp_path, monkeypatch):
+    """Make an oracle that is told from where the localizer looks."""
+    drive = record(tmp_path / 'frames', StreetWithCamera(), StreetWithCamera().truth(), SMALL)
+
+    def make(scale):
+        predictor = Oracle(drive, np.asarray(scale))
+        from cmrnet_ekf.camera_localizer import CameraLocalizer
+
+        ask = CameraLocalizer.locate_framed
+
+        def locate(self, framed, points, T_map_guess):
+            # Points and guess are told from a tile's corner.
+            T = T_map_guess.copy()
+            T[:2, 3] += predictor.origin[:2]
+            predictor.T_map_looked = T @ T_BASE_CAMERA @ T_OPTICAL_BODY
+            return ask(self, framed, points, T_map_guess)
+
+        monkeypatch.setattr(CameraLocalizer, 'locate_framed', locate)
+        local_map = street_map(tmp_path / 'map')
+        around = local_map.around
+
+        def near(T_map_base):
+            points, predictor.origin = around(T_map_base)
+            return points, predictor.origin
+
+        monkeypatch.setattr(local_map, 'around', near)
+        return drive, local_map, predictor
+
+    return make
+
+
+def test_a_recorded_drive_comes_back_and_moves_as_it_did(tmp_path):
+    bend = BendWithImu()
+    drive = record(tmp_path, bend, bend.truth(), SMALL)
+    assert drive.turned_by == 'imu' and len(drive) == 10 and drive.frames.shape[1:3] == (32, 64)
+    np.testing.assert_allclose(drive.turn_rates_radps[1:], 0.2, atol=1e-9)
+    np.testing.assert_allclose(drive.speeds_mps[1:], 15.0, rtol=1e-6)
+    np.testing.assert_allclose(drive.T_map_base, bend.truth().T_world_body)
+    again = record(tmp_path, None, None, SMALL)
+    np.testing.assert_array_equal(again.frames, drive.frames)
+    assert again.images == tuple(SMALL.images) and again.camera.K[0, 0] == drive.camera.K[0, 0]
+
+
+def test_exact_motion_from_the_right_start_stays_right(tmp_path):
+    bend = BendWithImu()
+    drive = record(tmp_path, bend, bend.truth(), SMALL)
+    right = replace(EXACT, start_translation=0.0, start_rotation=0.0)
+    found = track(drive, None, [], 0, settings=right)
+    assert found.metres.max() < 1e-6 and found.radians.max() < 1e-6
+    assert not found.diverged and len(found.metres) == 9
+
+
+def test_wrong_starts_differ_by_seed_and_stay_without_a_camera(tmp_path):
+    drive = record(tmp_path, StreetWithCamera(), StreetWithCamera().truth(), SMALL)
+    one, other = (track(drive, None, [], seed, settings=EXACT) for seed in (0, 1))
+    assert one.radians[0] == pytest.approx(one.radians[-1])
+    assert one.metres[0] != other.metres[0]
+    again = track(drive, None, [], 0, settings=EXACT)
+    np.testing.assert_array_equal(one.metres, again.metres)
+
+
+@pytest.mark.parametrize('filtered', [True, False])
+def test_a_camera_that_knows_takes_the_error_away(oracle, filtered):
+    drive, local_map, predictor = oracle(np.full(6, 1e-4))
+    found = track(drive, local_map, [predictor], 3, filtered=filtered, settings=EXACT)
+    # The camera is a metre from base: its yaw error counts there too.
+    assert found.metres.max() < 2e-3 and found.radians.max() < 2e-3
+    assert found.skipped == 0 and len(found.xi) == 9
+
+
+def test_the_errors_that_come_with_observations_fit_their_covariances(oracle):
+    scale = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.03])
+    drive, local_map, predictor = oracle(scale)
+    runs = [track(drive, local_map, [predictor], seed, settings=EXACT) for seed in range(30)]
+    xi, C = (np.concatenate(part) for part in ([r.xi for r in runs], [r.covariances for r in runs]))
+    nees = np.einsum('ni,nij,nj->n', xi, np.linalg.inv(C), xi)
+    assert nees.mean() == pytest.approx(6.0, abs=0.7)
+    filtered = np.concatenate([r.metres for r in runs])
+    raw = np.linalg.norm(xi[:, :3], axis=1)
+    assert filtered.mean() < raw.mean() * 1.05
+
+
+def test_covariances_of_components_are_those_of_drawn_poses():
+    rng = np.random.default_rng(1)
+    T = pose_matrix(np.array([5.0, -2.0, 1.0, 0.1, -0.2, 1.3]))
+    deviations = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.03])
+    draws = [T @ se3.exp(rng.normal(size=6) * deviations) for _ in range(4000)]
+    sampled = np.cov(np.array([pose_vector(one) for one in draws]).T)
+    found = component_covariance(T, np.diag(deviations**2))
+    root = np.sqrt(np.diag(sampled))
+    np.testing.assert_allclose(
+        found / np.outer(root, root), sampled / np.outer(root, root), atol=0.08
+    )
+
+
+def made_track(metres, degrees, seed=0) -> Track:
+    metres = np.asarray(metres, float)
+    nothing = np.zeros((0, 6)), np.zeros((0, 6, 6))
+    T = np.tile(np.eye(4), (len(metres), 1, 1))
+    return Track(seed, T, metres, np.deg2rad(degrees), *nothing, skipped=1)
+
+
+def test_figures_count_all_images_of_all_runs():
+    one, lost = made_track([1.0, 2.0, 3.0], [1, 1, 1]), made_track([4.0, 5.0, 9.0], [2, 2, 8], 1)
+    found = figures_of([one, lost])
+    assert found['t_max_m'] == 9.0 and found['t_mean_m'] == 4.0 and found['t_median_m'] == 3.5
+    assert found['r_median_deg'] == pytest.approx(1.5) and found['r_max_deg'] == pytest.approx(8.0)
+    assert (found['runs'], found['diverged']) == (2, 1)
+    assert found['skipped_share'] == pytest.approx(2 / 6)
+    back = made_track([*[20.0] * 50, *[0.5] * 50], np.ones(100))
+    assert not back.diverged, 'it found back'
+
+
+def test_ways_are_the_rows_of_the_table():
+    networks = {
+        'cmrnet': [Predictor([Cmrnet(SMALL)])],
+        'mcd': [Predictor([Cmrnet(replace(SMALL, dropout=0.3))])],
+        'der': [Predictor([Cmrnet(replace(SMALL, head='evidential'))])],
+    }
+    found = ways(networks)
+    assert list(found) == ['motion', 'unfiltered', 'mcd', 'der']
+    assert not found['unfiltered'].filtered and found['der'].filtered
+
+
+def test_what_does_not_fit_is_refused(tmp_path):
+    street = StreetWithCamera()
+    drive = record(tmp_path / 'frames', street, street.truth(), SMALL)
+    local_map = street_map(tmp_path / 'map')
+    with pytest.raises(ConfigError, match='plain'):
+        track(drive, local_map, [Predictor([Cmrnet(SMALL)])], 0)
+    with pytest.raises(ConfigError, match='recorded for images'):
+        track(drive, local_map, [Predictor([Cmrnet(replace(SMALL, focal=50.0))])], 0)
+    street.camera = None
+    with pytest.raises(DataError, match='no camera'):
+        record(tmp_path / 'none', street, street.truth(), SMALL)
+
+
+def test_the_command_tracks_with_networks(tmp_path, monkeypatch, capsys):
+    assert CAMERA.width == 128
+    street_map(tmp_path / 'map')
+    monkeypatch.setattr(command, 'drive_from', lambda arguments: StreetWithCamera())
+    monkeypatch.setattr(command, 'span_ns', lambda *a: (0, None))
+    for role, head in (('plain', 'quaternion'), ('der', 'evidential')):
+        save_network(tmp_path / f'{role}.safetensors', Cmrnet(replace(SMALL, head=head)), {})
+    out = tmp_path / 'out'
+    line = ['made_up', '--map', f'{tmp_path}/map', '--out', str(out), '--runs', '2', '--quiet']
+    line += [
+        '--networks',
+        f'cmrnet={tmp_path}/plain.safetensors',
+        f'der={tmp_path}/der.safetensors',
+    ]
+    assert command.main(line) == 0
+    figures = json.loads((out / 'results.json').read_text())['ways']
+    assert list(figures) == ['motion', 'unfiltered', 'der']
+    assert figures['der']['runs'] == 2
+    with np.load(out / 'tracks.npz') as kept:
+        T = kept['der_1_pose']
+        metres = [
+            np.linalg.norm(kept[f'der_{seed}_pose'][:, :3, 3] - truth_positions(), axis=1)
+            for seed in (0, 1)
+        ]
+    assert T.shape == (9, 4, 4)
+    assert figures['der']['t_mean_m'] == pytest.approx(np.mean(metres))
+    assert (out / 'heat.png').stat().st_size > 5000
+    assert 'unfiltered' in capsys.readouterr().out
+    assert command.main([*line, '--set', 'speed=1']) == 1
+    assert 'no setting' in capsys.readouterr().err
+
+
+def truth_positions():
+    return StreetWithCamera().truth().positions[1:]
