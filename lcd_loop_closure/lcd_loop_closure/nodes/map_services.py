@@ -1,14 +1,13 @@
 """Serve what people ask of a map: save, load, pause, reset, add or remove a loop."""
 
-import threading
 from typing import TYPE_CHECKING
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from lcd_common.errors import DataError, LocalizationError, MapError
+from lcd_common.errors import DataError, MapError
 from lcd_common.nodes import messages
+from lcd_common.nodes.awaited import Awaited
 from lcd_loop_closure.map_store import SavedMap, save_map
 from lcd_msgs.srv import AddLoop, LoadMap, RemoveLoop, SaveMap
 
@@ -21,10 +20,10 @@ class MapServices:
 
     def __init__(self, node: 'PoseGraphNode', *, threaded: bool) -> None:
         """Offer them; threaded, a map is written beside the callbacks."""
-        self._node, self._threaded = node, threaded
+        self._node = node
+        self._awaited = Awaited(node, threaded=threaded)
         # A group of their own: odometry goes on while a save is awaited.
         group = MutuallyExclusiveCallbackGroup()
-        self._wake = node.create_guard_condition(lambda: None, callback_group=None)
         for kind, name, callback in (
             (SaveMap, '~/save_map', self.on_save_map),
             (LoadMap, '~/load_map', self.on_load_map),
@@ -42,12 +41,10 @@ class MapServices:
         saved = self._node.map.saved()
         if not len(saved.graph):
             response.message = 'there is no keyframe yet: nothing was saved'
-        elif self._threaded:
-            written: Future = Future()
-            threading.Thread(target=self._write, args=(saved, request.path, written)).start()
-            response.success, response.message = await written
         else:
-            response.success, response.message = _saved(saved, request.path)
+            response.success, response.message = await self._awaited.answer(
+                lambda: _saved(saved, request.path), f'{request.path}: the map could not be saved'
+            )
         return response
 
     def on_load_map(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
@@ -107,16 +104,7 @@ class MapServices:
             response.message = f'there is no loop {ids}'
         return response
 
-    def _write(self, saved: SavedMap, path: str, written: Future) -> None:
-        written.set_result(_saved(saved, path))
-        self._wake.trigger()  # the executor may be asleep
 
-
-def _saved(saved: SavedMap, path: str) -> tuple[bool, str]:
-    try:
-        folder = save_map(saved, path)
-    except LocalizationError as error:
-        return False, str(error)
-    except Exception as error:  # noqa: BLE001 - a service that never answers is worse
-        return False, f'{path}: the map could not be saved: {error!r}'
-    return True, f'{len(saved.graph)} keyframes saved in {folder}'
+def _saved(saved: SavedMap, path: str) -> str:
+    folder = save_map(saved, path)
+    return f'{len(saved.graph)} keyframes saved in {folder}'

@@ -1,13 +1,12 @@
 """Serve what people ask of the places: add, save, load, look again, reset."""
 
-import threading
 from typing import TYPE_CHECKING
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from lcd_common.errors import LocalizationError
+from lcd_common.nodes.awaited import Awaited
 from lcd_msgs.srv import LoadMap, SaveMap
 from uncertain_place_recognition.place_recognizer import PlaceRecognizer
 
@@ -20,9 +19,9 @@ class PlaceServices:
 
     def __init__(self, node: 'PlaceRecognitionNode', *, threaded: bool) -> None:
         """Offer them; threaded, places are written beside the callbacks."""
-        self._node, self._threaded = node, threaded
+        self._node = node
+        self._awaited = Awaited(node, threaded=threaded)
         group = MutuallyExclusiveCallbackGroup()
-        self._wake = node.create_guard_condition(lambda: None, callback_group=None)
         for kind, name, callback in (
             (Trigger, '~/add_place', self.on_add_place),
             (SaveMap, '~/save_map', self.on_save_map),
@@ -47,12 +46,11 @@ class PlaceServices:
         recognizer = self._node.recognizer
         if not len(recognizer):
             response.message = 'there is no place yet: nothing was saved'
-        elif self._threaded:
-            written: Future = Future()
-            threading.Thread(target=self._write, args=(recognizer, request.path, written)).start()
-            response.success, response.message = await written
         else:
-            response.success, response.message = _saved(recognizer, request.path)
+            response.success, response.message = await self._awaited.answer(
+                lambda: _saved(recognizer, request.path),
+                f'{request.path}: the places could not be saved',
+            )
         return response
 
     def on_load_map(self, request: LoadMap.Request, response: LoadMap.Response) -> LoadMap.Response:
@@ -86,16 +84,7 @@ class PlaceServices:
         response.success, response.message = True, 'there are no places'
         return response
 
-    def _write(self, recognizer: PlaceRecognizer, path: str, written: Future) -> None:
-        written.set_result(_saved(recognizer, path))
-        self._wake.trigger()  # the executor may be asleep
 
-
-def _saved(recognizer: PlaceRecognizer, path: str) -> tuple[bool, str]:
-    try:
-        folder = recognizer.save(path)
-    except LocalizationError as error:
-        return False, str(error)
-    except Exception as error:  # noqa: BLE001 - a service that never answers is worse
-        return False, f'{path}: the places could not be saved: {error!r}'
-    return True, f'{len(recognizer)} places saved in {folder}'
+def _saved(recognizer: PlaceRecognizer, path: str) -> str:
+    folder = recognizer.save(path)
+    return f'{len(recognizer)} places saved in {folder}'
