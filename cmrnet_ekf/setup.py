@@ -43,6 +43,7 @@ setup(
             'make_cmrnet_samples = cmrnet_ekf.training.make:main',
             'train_cmrnet = cmrnet_ekf.training.train:main',
             'evaluate_cmrnet = cmrnet_ekf.evaluation.evaluate:main',
+            'track_cmrnet = cmrnet_ekf.evaluation.track:main',
         ],
     },
     zip_safe=False,

@@ -1,6 +1,7 @@
 """Reject predictions that are too uncertain (thesis section 5.3.6)."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmrnet_ekf.pose_belief import PoseBelief
 from lcd_common.se3 import Array
@@ -12,7 +13,9 @@ def traces(belief: PoseBelief) -> Array:
     return np.stack([variance[:, :3].sum(1), variance[:, 3:].sum(1)], 1)
 
 
-def accepted(traces_: Array, share: float = 0.15, thresholds: Array | None = None) -> Array:
+def accepted(
+    traces_: Array, share: float = 0.15, thresholds: Array | None = None
+) -> NDArray[np.bool_]:
     """Tell [N] which predictions are kept: neither trace lies in its top share.
 
     Args:
