@@ -48,7 +48,7 @@ def evaluate(work: Path, quick: bool = False) -> dict[str, Any]:
     drive = open_drive(folder() / 'data' / 'kitti_360')
     poses = reference(drive)
     mapped, judged = poses.stamps_ns[:_MAPPED], poses.stamps_ns[_MAPPED:]
-    found = predictors()
+    found = predictors(others=False)
     der = found['der'].networks[0]
     kept = work / 'kitti_360'
     local_map = LocalMap(build(kept / 'map', drive, poses, mapped))

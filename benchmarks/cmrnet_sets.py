@@ -22,8 +22,6 @@ from cmrnet_ekf.training.towns import map_town, seen_town
 from lcd_common.errors import DataError
 
 ROLES = ('cmrnet', 'mcd', 'de', 'der')
-# Beside the thesis's: what the ablation and the full covariance show.
-OTHERS = ('nll', 'covariance')
 LATER = ('second', 'third')
 TOWNS = (200, 201, 202)  # of the frozen test split
 LENGTH_M = 600.0
@@ -32,10 +30,13 @@ TRACKED_TOWN, TRACKED_M = 203, 1200.0
 _TILES = 2000
 
 
-def predictors(stage: str = '', samples: int = MCD_SAMPLES) -> dict[str, Predictor]:
+def predictors(
+    stage: str = '', samples: int = MCD_SAMPLES, others: bool = True
+) -> dict[str, Predictor]:
     """Return networks by role: $CMRNET_WEIGHTS/<role>, of later stages $CMRNET_WEIGHTS/second/...
 
     A role is a .safetensors file, a folder of train_cmrnet, or (an ensemble) a folder of such.
+    What else lies there (other losses, say) comes behind the thesis's four, if asked for.
 
     Raises:
         DataError: there are none of the first stage, or one of the thesis's is missing.
@@ -43,20 +44,23 @@ def predictors(stage: str = '', samples: int = MCD_SAMPLES) -> dict[str, Predict
     named = os.environ.get('CMRNET_WEIGHTS')
     if not named:
         raise DataError(
-            'set CMRNET_WEIGHTS to a folder with trained networks, one each: '
-            f'{", ".join(ROLES)} (and {", ".join(OTHERS)}, if there are)'
+            f'set CMRNET_WEIGHTS to a folder with trained networks, one each: {", ".join(ROLES)}'
         )
     folder = Path(named) / stage
-    texts = []
-    for role in (*ROLES, *OTHERS):
-        for path in (folder / f'{role}.safetensors', folder / role):
-            if path.exists():
-                texts.append(f'{role}={path}')
-                break
-        else:
-            if role in ROLES and not stage:
-                raise DataError(f'{folder}: expected {", ".join(ROLES)} in it; {role} is missing')
-    return named_predictors(texts, samples=samples)
+    there = sorted(folder.iterdir()) if folder.is_dir() else []
+    paths = {
+        path.stem: path
+        for path in there
+        if path.suffix == '.safetensors' or (path.is_dir() and path.name not in LATER)
+    }
+    missing = [role for role in ROLES if role not in paths]
+    if missing and not stage:
+        raise DataError(
+            f'{folder}: expected {", ".join(ROLES)} in it; {", ".join(missing)} is missing'
+        )
+    rest = [role for role in paths if role not in ROLES] if others else []
+    wanted = [role for role in (*ROLES, *rest) if role in paths]
+    return named_predictors([f'{role}={paths[role]}' for role in wanted], samples=samples)
 
 
 @cache

@@ -7,6 +7,7 @@ from typing import Any
 from tqdm import tqdm
 
 from benchmarks.cmrnet_sets import LATER, predictors, tracked
+from benchmarks.ekf_consistency import TRACKS
 from cmrnet_ekf.evaluation.track import write_tracks
 from cmrnet_ekf.evaluation.tracking import Track
 from cmrnet_ekf.evaluation.tracking_study import draw, figures_of, markdown, tracks, ways
@@ -18,9 +19,11 @@ RUNS, RUNS_DER = 3, 20
 
 def evaluate(work: Path, quick: bool = False) -> dict[str, Any]:
     """Track with each way from wrong start poses; later stages refine where they are trained."""
-    found: dict[str, list[Predictor]] = {role: [one] for role, one in predictors().items()}
+    found: dict[str, list[Predictor]] = {
+        role: [one] for role, one in predictors(others=False).items()
+    }
     for stage in LATER:
-        for role, one in predictors(stage).items():
+        for role, one in predictors(stage, others=False).items():
             found[role].append(one)
     drive, local_map = tracked(work, next(iter(found.values()))[0].settings, quick)
     single = {role: stages[:1] for role, stages in found.items()}
@@ -57,5 +60,5 @@ def _run(
     draw(drive, found, folder / f'{name}.png')
     figures = {way: figures_of(of_way) for way, of_way in found.items()}
     (folder / f'{name}.md').write_text(markdown(figures, drive.name))
-    write_tracks(found, work / f'{name}_tracks.npz')
+    write_tracks(found, work / TRACKS.replace('heat', name))
     return figures

@@ -3,7 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ GNSS_SIGMAS = np.array([1.5, 1.5, 3.0])
 ANTENNA = np.array([-0.5, 0.3, 1.2])
 SPEED_SIGMA = 0.1
 _SETTLING_S = 2.0
+_STARTING = 20  # images
+TRACKS = 'heat_tracks.npz'  # of the section `ekf`, in the work folder
 
 
 @dataclass(frozen=True)
@@ -224,8 +226,46 @@ def order_invariance(seconds: float = 10.0) -> dict[str, Any]:
     }
 
 
-def section(_work: Path, runs: int = 50) -> dict[str, Any]:
-    """Measure everything about consistency."""
+def camera_errors(tracks: Path, way: str = 'der') -> CameraErrors | None:
+    """Return the errors that a way of the closed loop made; None when it has not been driven.
+
+    Each run is a sequence, without the two seconds in which the wrong start is taken away.
+    """
+    if not tracks.is_file():
+        return None
+    with np.load(tracks, allow_pickle=False) as kept:
+        names = [name[: -len('_xi')] for name in kept.files if name.endswith('_xi')]
+        names = [name for name in names if name.rpartition('_')[0] == way]
+        xi = [kept[f'{name}_xi'][_STARTING:] for name in names]
+        covariances = [kept[f'{name}_covariance'][_STARTING:] for name in names]
+    length = min((len(one) for one in xi), default=0)
+    if not length:
+        return None
+    return CameraErrors(
+        np.array([one[:length] for one in xi]), np.array([one[:length] for one in covariances])
+    )
+
+
+def with_real_errors(camera: CameraErrors, runs: int) -> dict[str, Any]:
+    """Return consistency with a camera's own errors and covariances, by what is told of them.
+
+    Errors of one scene last: both are shown, independent ones and such that fade in a second.
+    """
+    flat, C = camera.xi.reshape(-1, 6), camera.covariances.reshape(-1, 6, 6)
+    own = np.einsum('ni,nij,nj->n', flat, np.linalg.inv(C), flat)
+    figures: dict[str, Any] = {
+        'sequences': len(camera.xi),
+        'observations': len(flat),
+        'nees_of_observations_mean': float(own.mean()),
+        'nees_of_observations_median': float(np.median(own)),
+    }
+    for name, seconds in (('independent', 0.0), ('correlated_1s', 1.0)):
+        figures[name] = consistency(runs, camera=replace(camera, correlation_s=seconds))
+    return figures
+
+
+def section(work: Path, runs: int = 50) -> dict[str, Any]:
+    """Measure everything about consistency; CMRNet's errors too where `ekf` left them."""
     from benchmarks.nodes.ekf_recovery import recoveries
 
     recovered = recoveries()
@@ -235,4 +275,7 @@ def section(_work: Path, runs: int = 50) -> dict[str, Any]:
         'recovered': all(case['recovered'] for case in recovered.values()),
         'recovery': recovered,
     }
+    camera = camera_errors(work / TRACKS)
+    if camera is not None:
+        figures['with_cmrnet'] = with_real_errors(camera, runs)
     return {'consistency': figures, **speed()}

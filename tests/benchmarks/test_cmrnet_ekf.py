@@ -1,6 +1,7 @@
 """How the sections of benchmarks.cmrnet_ekf are put together, on answers that are made up."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks import (
     cmrnet_sets,
     cmrnet_speed,
     cmrnet_tracking,
+    ekf_consistency,
     report,
 )
 from cmrnet_ekf.evaluation.study import Study
@@ -75,8 +77,6 @@ def weights(tmp_path, monkeypatch):
     """Untrained networks in all the forms that a role may have."""
     folder = tmp_path / 'weights'
     torch.manual_seed(0)
-    from dataclasses import replace
-
     save_network(folder / 'cmrnet.safetensors', Cmrnet(SMALL), {})
     save_network(folder / 'mcd' / 'best.safetensors', Cmrnet(replace(SMALL, dropout=0.3)), {})
     save_network(folder / 'mcd' / 'checkpoint.safetensors', Cmrnet(SMALL), {})
@@ -96,6 +96,9 @@ def test_weights_are_found_by_role(weights):
     }  # fmt: skip
     assert list(cmrnet_sets.predictors('second')) == ['der']
     assert cmrnet_sets.predictors('third') == {}
+    save_network(weights / 'der_log.safetensors', Cmrnet(replace(SMALL, head='evidential')), {})
+    assert list(cmrnet_sets.predictors()) == ['cmrnet', 'mcd', 'de', 'der', 'der_log']
+    assert list(cmrnet_sets.predictors(others=False)) == ['cmrnet', 'mcd', 'de', 'der']
     (weights / 'cmrnet.safetensors').unlink()
     with pytest.raises(DataError, match='cmrnet is missing'):
         cmrnet_sets.predictors()
@@ -124,6 +127,8 @@ def test_the_closed_loop_has_its_required_figures(weights, monkeypatch, tmp_path
     assert not [key for key in absent if key.startswith('ekf.')]
     assert figures['ekf']['conditions']['images'] == 10
     assert list(figures['ekf']['refined']) == ['motion', 'der']
+    errors = ekf_consistency.camera_errors(tmp_path / ekf_consistency.TRACKS, 'motion')
+    assert errors is None, 'no camera, no errors'
     assert cmrnet_tracking.RUNS_DER >= 20 and cmrnet_sets.TRACKED_M >= 1000.0
     assert (tmp_path / 'pictures' / 'cmrnet' / 'heat.png').is_file()
 
@@ -139,3 +144,21 @@ def test_the_street_that_is_timed_has_the_size_and_fill_that_are_told():
     imager = LidarImager(camera_model(), LidarImageConfig(radius=0))
     image = imager.image(points, se3.inverse(cmrnet_speed.T_BASE_CAMERA))
     assert float((image > 0).float().mean()) == pytest.approx(0.25, abs=0.005)
+
+
+def test_errors_of_the_closed_loop_become_those_of_the_filters_camera(tmp_path):
+    rng = np.random.default_rng(0)
+    sigmas = np.array([0.2, 0.1, 0.1, 0.01, 0.01, 0.02])
+    arrays = {}
+    for seed, count in enumerate((60, 50)):
+        arrays[f'der_{seed}_xi'] = rng.normal(size=(count, 6)) * sigmas
+        arrays[f'der_{seed}_covariance'] = np.tile(np.diag(sigmas**2), (count, 1, 1))
+        arrays[f'de_{seed}_xi'] = np.ones((count, 6))
+        arrays[f'de_{seed}_covariance'] = np.tile(np.eye(6), (count, 1, 1))
+    np.savez(tmp_path / 'tracks.npz', **arrays)
+    camera = ekf_consistency.camera_errors(tmp_path / 'tracks.npz')
+    assert camera is not None and camera.xi.shape == (2, 30, 6)
+    np.testing.assert_array_equal(camera.xi[1], arrays['der_1_xi'][20:])
+    found = ekf_consistency.consistency(3, 6.0, camera)
+    assert found['nis_camera'] == pytest.approx(6.0, abs=1.5)
+    assert ekf_consistency.camera_errors(tmp_path / 'none.npz') is None

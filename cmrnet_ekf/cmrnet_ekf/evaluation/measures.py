@@ -14,6 +14,7 @@ from lcd_common.se3 import Array
 SHARE = 0.15
 SHARES: Array = np.linspace(0.0, 0.6, 25)
 MCD_COUNTS = (2, 3, 5, 10, 20, 30, 50, 100)
+_LEAST_LEFT = 0.05
 
 
 def of_uncertainty(answers: Answers) -> dict[str, dict[str, float]]:
@@ -53,10 +54,11 @@ def after_rejection(answers: Answers, share: float = SHARE) -> dict[str, float]:
 def by_confidence(answers: Answers) -> dict[str, list[float]]:
     """Return mean errors of what is kept against the top share that is discarded (Fig. 5.5).
 
-    It ends where nothing is left.
+    It ends where too few are left to have a mean.
     """
     found = traces(answers.belief)
-    shares = [float(share) for share in SHARES if accepted(found, float(share)).any()]
+    least = max(_LEAST_LEFT * len(found), 1)
+    shares = [float(share) for share in SHARES if accepted(found, float(share)).sum() >= least]
     rows = [after_rejection(answers, share) for share in shares]
     keys = ('t_mean_m', 'r_mean_deg', 'discarded_share')
     return {'top_share': shares, **{key: [row[key] for row in rows] for key in keys}}

@@ -76,8 +76,8 @@ def _rejection(study: Study, path: Path) -> Path:
             for ax, key in zip(axes, ('t_mean_m', 'r_mean_deg'), strict=True):
                 ax.plot(found['top_share'], found[key], color=colour[name], label=name)
         for ax, unit in zip(axes, ('[m]', '[degrees]'), strict=True):
+            ax.set(xlabel='top share of either trace discarded', ylim=(0, _above(ax)))
             ax.axvline(SHARE, color='0.6', lw=1, ls=(0, (4, 4)))
-            ax.set(xlabel='top share of either trace discarded', ylim=(0, None))
             ax.set_ylabel(f'mean error of the rest {unit}')
         axes[0].set_title('Translation')
         axes[1].set_title('Rotation')
@@ -106,7 +106,8 @@ def _counts(study: Study, path: Path) -> Path:
             for ax, (key, _) in zip(axes, panels, strict=True):
                 ax.plot(at, [r[key] for r in found.values()], '.-', color=colour[name], label=name)
         for ax, (_, label) in zip(axes, panels, strict=True):
-            ax.set(xlabel='draws (MCD), members (DE)', ylabel=label, xscale='log', ylim=(0, None))
+            ax.set(xlabel='draws (MCD), members (DE)', ylabel=label, xscale='log')
+            ax.set_ylim(0, _above(ax))
             ax.set_xticks([2, 5, 10, 30, 100], ['2', '5', '10', '30', '100'])
         axes[0].legend()
     return path
@@ -135,3 +136,10 @@ def _stretch(stretch: Stretch, path: Path) -> Path:
         if shown is not None:
             canvas.colorbar(shown, ax=axes, label='translation error [m]')
     return path
+
+
+def _above(ax: Axes) -> float:
+    """Return a limit above all lines of finite values."""
+    values = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in ax.lines])
+    finite = values[np.isfinite(values)]
+    return 1.1 * float(finite.max()) if finite.size else 1.0

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
 from bags.records import CameraImage, CameraModel, Drive, ImuSample
@@ -17,7 +16,7 @@ from lcd_common.errors import DataError
 from lcd_common.trajectory import Trajectory
 
 _FACTS = 'facts.json'
-_FRAMES = 'frames.npy'
+_FRAMES = 'frames.raw'  # one behind the other: their number is known at the end
 
 
 @dataclass(frozen=True)
@@ -65,11 +64,14 @@ class TrackingDrive:
         """
         try:
             facts = json.loads((folder / _FACTS).read_text())
-            frames = np.load(folder / _FRAMES, mmap_mode='r', allow_pickle=False)
+            shape = tuple(facts['frames'])
+            frames = np.memmap(folder / _FRAMES, np.uint8, 'r', shape=shape)
             with np.load(folder / 'motion.npz', allow_pickle=False) as motion:
                 arrays = {name: motion[name] for name in motion.files}
-        except (OSError, ValueError) as error:
-            raise DataError(f'{folder}: no drive for tracking ({error}); record it anew') from error
+        except (OSError, ValueError, KeyError) as error:
+            raise DataError(
+                f'{folder}: no drive for tracking ({error}); remove it, it is made anew'
+            ) from error
         height, width = frames.shape[1:3]
         K = np.array(facts['K'], np.float64)
         camera = CameraModel('camera', width, height, K, tuple(facts['distortion']))
@@ -118,14 +120,20 @@ def record(
     if drive.camera is None or drive.camera.frame_id not in places:
         raise DataError(f'{drive.path}: has no camera whose place is known')
     framing = framing_of(drive.camera, network)
-    stamps, poses_at, framed = _images(drive, poses, framing.image, span_ns, progress)
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps, poses_at = [], []
+    with (folder / _FRAMES).open('wb') as file:
+        for image in drive.records(*span_ns, kinds=[CameraImage]):
+            assert isinstance(image, CameraImage)
+            T_map_base = poses.at(image.stamp_ns)
+            if T_map_base is None:
+                continue
+            stamps.append(image.stamp_ns)
+            poses_at.append(T_map_base)
+            file.write(framing.image(image.pixels).tobytes())
+            progress()
     if len(stamps) < 2:
         raise DataError(f'{drive.path}: fewer than two images have a pose; are stamps the same?')
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = open_memmap(folder / _FRAMES, 'w+', np.uint8, (len(framed), *framed[0].shape))
-    for number, image in enumerate(framed):
-        frames[number] = image
-    frames.flush()
     T, stamps_ns = np.array(poses_at), np.array(stamps, np.int64)
     dt = np.diff(stamps_ns) * 1e-9
     T_step = se3.inverse(T[:-1]) @ T[1:]
@@ -148,6 +156,7 @@ def record(
     facts = {
         'name': drive.name,
         'turned_by': turned_by,
+        'frames': [len(stamps), framing.camera.height, framing.camera.width, 3],
         'K': framing.camera.K.tolist(),
         'distortion': list(framing.camera.distortion),
         'T_base_camera': places[drive.camera.frame_id].tolist(),
@@ -155,26 +164,6 @@ def record(
     }
     (folder / _FACTS).write_text(json.dumps(facts, indent=1) + '\n')
     return TrackingDrive.load(folder)
-
-
-def _images(
-    drive: Drive,
-    poses: Trajectory,
-    framed: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
-    span_ns: tuple[int | None, int | None],
-    progress: Callable[[], object],
-) -> tuple[list[int], list[se3.Array], list[NDArray[np.uint8]]]:
-    stamps, poses_at, images = [], [], []
-    for image in drive.records(*span_ns, kinds=[CameraImage]):
-        assert isinstance(image, CameraImage)
-        T_map_base = poses.at(image.stamp_ns)
-        if T_map_base is None:
-            continue
-        stamps.append(image.stamp_ns)
-        poses_at.append(T_map_base)
-        images.append(framed(image.pixels))
-        progress()
-    return stamps, poses_at, images
 
 
 def _turn_rates(
