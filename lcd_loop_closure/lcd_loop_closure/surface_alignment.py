@@ -175,7 +175,9 @@ def held_information(matches: SurfaceMatches) -> tuple[Array, Array]:
 
 def _jacobian(points: Array, normal_lidar: Array) -> Array:
     """Return d(n . (T exp(xi) p))/d(xi) [M x 6] for normals of the lidar frame: n, p x n."""
-    return np.hstack([normal_lidar, np.cross(points, normal_lidar)])
+    (x, y, z), (u, v, w) = points.T, normal_lidar.T
+    # numpy's own cross product is slow on short arrays.
+    return np.column_stack([normal_lidar, y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def _information_bias(
@@ -197,7 +199,9 @@ def _information_bias(
     """
     bias = np.zeros((6, 6))
     across = np.maximum(variance[row, side], noise)
-    pole_rows = np.isin(row, row[side == 1])
+    pole = np.zeros(len(points), bool)
+    pole[row[side == 1]] = True
+    pole_rows = pole[row]
     for axis in (1, 2):
         use = ~pole_rows if axis == 1 else np.ones(len(row), bool)
         r = row[use]

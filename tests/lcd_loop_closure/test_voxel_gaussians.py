@@ -56,9 +56,10 @@ def test_far_voxels_are_forgotten_and_their_place_is_used_again() -> None:
     assert (grid.find(around) >= 0).all()
     assert (grid.find(np.array([[x - 100.0, 0.0, 0.0]])) < 0).all()
     assert len(grid) < 40 * 22 * 22 and len(grid._count) < 16_384
-    in_use = sorted(grid._slot.values())
+    in_use = sorted(grid._slot.tolist())
     assert len(set(in_use)) == len(in_use)
     assert set(in_use).isdisjoint(grid._free)
+    assert (np.diff(grid._keys) > 0).all()
 
 
 def test_clear_forgets() -> None:
