@@ -86,6 +86,7 @@ class OfflineSlam:
         self._scan_stamps: list[int] = []
         self._T_odom_base: dict[int, se3.Array] = {}
         self._loops: dict[tuple[int, int, str], LoopConstraint] = {}
+        self._judged: LoopConstraintArray | None = None
         self._map: PointCloud2 | None = None
         self.lockstep.listen('/points', self._on_points)
         self.lockstep.listen('/odom', self._on_odom)
@@ -111,6 +112,8 @@ class OfflineSlam:
 
     def result(self, drive: Drive, source: str, wall_s: float, interrupted: bool) -> DriveResult:
         """Return everything that the nodes have said and hold, free of ROS."""
+        for judged in () if self._judged is None else self._judged.loops:
+            self._remember(loop_from_message(judged))
         graph = self.pose_graph.map.graph.snapshot()
         scans = np.array(self._scan_stamps, np.int64)
         stamps = np.array(sorted(self._T_odom_base), np.int64)
@@ -152,8 +155,7 @@ class OfflineSlam:
         self._remember(loop_from_message(message))
 
     def _on_loops(self, message: LoopConstraintArray) -> None:
-        for loop in message.loops:
-            self._remember(loop_from_message(loop))
+        self._judged = message  # all loops each time: only the last one counts
 
     def _remember(self, loop: LoopConstraint) -> None:
         key = loop.match_id, loop.query_id, loop.method
