@@ -1,5 +1,7 @@
 """Decide whether a loop may enter the graph before any solver has judged it."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -40,17 +42,21 @@ class Admission:
         self._limit = float(np.sqrt(chi2.ppf(settings.admission_probability, 6)))
 
     def objection(
-        self, loop: GraphLoop, T_match_query: se3.Array, covariance: se3.Array
+        self, loop: GraphLoop, T_match_query: se3.Array, covariance: Callable[[], se3.Array]
     ) -> tuple[float, str]:
         """Return by how many metres a loop differs from the estimate, and why it may not enter.
 
         Args:
             loop: the loop.
             T_match_query: the same transform as the graph estimates it.
-            covariance: its 6x6, body axes of the query, translation first.
+            covariance: returns its 6x6, body axes of the query, translation first. Only asked for
+                where the loop's own covariance does not explain the difference alone: that of two
+                poses far apart in a large graph takes long, and could only explain more.
         """
         error = se3.log(se3.inverse(loop.T_match_query) @ T_match_query)
-        sigmas = float(np.sqrt(error @ np.linalg.solve(covariance + loop.covariance, error)))
+        sigmas = _sigmas(error, loop.covariance)
+        if sigmas > self._limit:
+            sigmas = _sigmas(error, covariance() + loop.covariance)
         metres, radians = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
         if sigmas > self._limit:
             return metres, (
@@ -60,3 +66,7 @@ class Admission:
         if metres > s.admission_distance or radians > s.admission_angle:
             return metres, f'asks for a shift of {metres:.1f} m and {radians:.2f} rad'
         return metres, ''
+
+
+def _sigmas(error: se3.Array, covariance: se3.Array) -> float:
+    return float(np.sqrt(error @ np.linalg.solve(covariance, error)))

@@ -121,7 +121,7 @@ class GraphFactors:
         GTSAM refuses to go on by Cholesky where one direction is known 4096 times worse than
         another, which ten kilometres without a loop, or a link that broke, already make so.
         """
-        poses = self._solver.poses
+        poses = self._solver.poses_read
         try:
             self._solver.update()
         except RuntimeError as error:

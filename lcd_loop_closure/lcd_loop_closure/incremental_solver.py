@@ -76,6 +76,11 @@ class IncrementalSolver:
             self._read_poses()
         return self._poses
 
+    @property
+    def poses_read(self) -> se3.Array:
+        """Poses [M x 4 x 4] as they were last asked for; not to be written to."""
+        return self._poses
+
     def pose(self, row: int) -> se3.Array:
         """Return one estimated pose after the last update."""
         T: se3.Array = self._isam.calculateEstimatePose3(self._keys[row]).matrix()

@@ -9,6 +9,7 @@ kernel from those it confirmed.
 
 import logging
 import time
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -324,8 +325,11 @@ class PoseGraph:
             shift_m, against = np.inf, ''
             if loop.state is not LoopState.BY_HAND:
                 rows = [self._odometry.row(i) for i in key]
-                estimate = self._factors.relative_pose(*rows), self._factors.loop_covariance(key)
-                shift_m, against = self._admission.objection(loop, *estimate)
+                shift_m, against = self._admission.objection(
+                    loop,
+                    self._factors.relative_pose(*rows),
+                    partial(self._factors.loop_covariance, key),
+                )
             if against:
                 self._ledger.decide(key, LoopState.HELD, f'{against}; waits for the solver')
                 held.append(key)
