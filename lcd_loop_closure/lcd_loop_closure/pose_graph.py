@@ -324,12 +324,9 @@ class PoseGraph:
             loop = self._ledger[key]
             shift_m, against = np.inf, ''
             if loop.state is not LoopState.BY_HAND:
-                rows = [self._odometry.row(i) for i in key]
-                shift_m, against = self._admission.objection(
-                    loop,
-                    self._factors.relative_pose(*rows),
-                    partial(self._factors.loop_covariance, key),
-                )
+                estimate = self._factors.relative_pose(*(self._odometry.row(i) for i in key))
+                covariance = partial(self._factors.loop_covariance, key)
+                shift_m, against = self._admission.objection(loop, estimate, covariance)
             if against:
                 self._ledger.decide(key, LoopState.HELD, f'{against}; waits for the solver')
                 held.append(key)
@@ -367,8 +364,8 @@ class PoseGraph:
         changed = sorted(before ^ (later | broken))
         for row in changed:
             what = 'contradicted by the loops, given up' if row in broken else 'believed again'
-            first, second = self._odometry.ids[row - 1 : row + 1]
-            _log.warning('odometry between keyframes %d and %d: %s', first, second, what)
+            between = self._odometry.ids[row - 1 : row + 1]
+            _log.warning('odometry between keyframes %d and %d: %s', *between, what)
         return [self._odometry.ids[row] for row in changed]
 
     def _carry_in(self, verdict: Verdict) -> None:
@@ -398,7 +395,5 @@ class PoseGraph:
     ) -> GraphUpdate:
         moved = self._factors.poses[: len(before), :3, 3] - before[:, :3, 3]
         shift = float(np.sqrt(np.einsum('ij,ij->i', moved, moved).max())) if len(before) else 0.0
-        seconds = time.perf_counter() - started
-        return GraphUpdate(
-            keyframes, tuple(loops_in), tuple(out), tuple(held), tuple(links), shift, seconds
-        )
+        changes = tuple(loops_in), tuple(out), tuple(held), tuple(links)
+        return GraphUpdate(keyframes, *changes, shift, time.perf_counter() - started)
