@@ -69,6 +69,12 @@ class LoopSearch:
         """Number of remembered keyframes."""
         return 0 if self._detector is None else self._detector.size
 
+    @property
+    def device(self) -> str | None:
+        """Where the network of the descriptor runs; None when it has none."""
+        device = getattr(self._descriptor, 'device', None)
+        return None if device is None else str(device)
+
     def keyframe(self, session: Session, pose: StampedPose, cloud: PointCloud) -> Keyframe | None:
         """Reduce and describe a sweep (base frame) and make it the session's next keyframe.
 

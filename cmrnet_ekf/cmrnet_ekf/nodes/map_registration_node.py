@@ -115,6 +115,7 @@ class MapRegistrationNode(Node):
             ('cuda' if torch.cuda.is_available() else 'cpu') if c.device == 'auto' else c.device
         )
         self._stages = [Predictor.load(Path(path), device, c.samples) for path in weights]
+        self.get_logger().info(f'{len(weights)} stages run on {device}')
         if self._stages[-1].kind == 'plain':
             raise ConfigError(
                 f'{weights[-1]} does not say how sure it is; the last network must be of the '

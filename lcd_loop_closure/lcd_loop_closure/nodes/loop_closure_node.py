@@ -109,6 +109,8 @@ class LoopClosureNode(Node):
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
         self._search = None if self.config.beside else LoopSearch(detector, self.diagnostics.stage)
+        if self._search is not None and self._search.device:
+            self.get_logger().info(f'the descriptor runs on {self._search.device}')
         self._buffer: StampBuffer[PointCloud2] = StampBuffer(
             self.config.waiting_clouds, round(self.config.max_odometry_gap * 1e9)
         )

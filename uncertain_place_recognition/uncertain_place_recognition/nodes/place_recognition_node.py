@@ -132,6 +132,8 @@ class PlaceRecognitionNode(Node):
             self._reduction,
             self.config.device,
         )
+        ensemble = self.recognizer.ensemble
+        self.get_logger().info(f'{ensemble.size} networks run on {ensemble.device}')
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
         self._by_keyframes = self.config.follow == 'keyframes'
