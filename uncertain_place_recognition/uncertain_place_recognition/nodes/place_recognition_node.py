@@ -44,6 +44,7 @@ from lcd_common.nodes.worker import Worker
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
 from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
+from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
@@ -132,8 +133,7 @@ class PlaceRecognitionNode(Node):
             self._reduction,
             self.config.device,
         )
-        ensemble = self.recognizer.ensemble
-        self.get_logger().info(f'{ensemble.size} networks run on {ensemble.device}')
+        self.get_logger().info(f'the networks run on {choose_device(self.config.device)}')
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
         self._by_keyframes = self.config.follow == 'keyframes'
