@@ -19,7 +19,6 @@ from uncertain_place_recognition.submap import SubmapMaker
 
 ARCHITECTURES = ('minkloc3d', 'pointnetvlad')
 SPACING_M = 10.0
-_WEIGHTS = 'PLACE_WEIGHTS'
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def weights(architecture: str) -> dict[str, Path]:
     Raises:
         DataError: there are none.
     """
-    named = os.environ.get(_WEIGHTS)
+    named = os.environ.get('PLACE_WEIGHTS')
     if not named:
         raise DataError(
             'set PLACE_WEIGHTS to a folder with weights, <architecture>/<role> each: '
@@ -98,11 +97,10 @@ def embedded(
     files = [kept / f'{one}.npz' for one in names]
     if all(file.is_file() for file in files):
         runs = [EmbeddedRun.load(file) for file in files]
-        if not os.environ.get(_WEIGHTS) or not set(_found(architecture, roles)) - set(
-            runs[0].members
-        ):
+        known = weights(architecture) if os.environ.get('PLACE_WEIGHTS') else {}
+        if known.keys() & set(roles) <= runs[0].members.keys():
             return runs  # nothing would be added
-    found = _found(architecture, roles)
+    found = {role: path for role, path in weights(architecture).items() if role in roles}
     ensembles = load_ensembles([f'{role}={path}' for role, path in found.items()], 'cpu')
     if not ensembles:
         raise DataError(f'{architecture} has none of the ensembles {", ".join(roles)}')
@@ -118,10 +116,6 @@ def embedded(
             world = town_name(chosen, seed)
             run_of_drive(drive, maker, spacing_m=SPACING_M, world=world).save(path)
     return load_embedded(made, ensembles, kept)
-
-
-def _found(architecture: str, roles: tuple[str, ...]) -> dict[str, Path]:
-    return {role: path for role, path in weights(architecture).items() if role in roles}
 
 
 def town_name(chosen: TestSet, seed: int) -> str:

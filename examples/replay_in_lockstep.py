@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import rclpy
 
+from bags.inputs import open_input
 from bags.nodes.lockstep import LockStep
 from lcd_common import command_line
 from lcd_common.nodes.parameters import overrides
@@ -23,14 +24,13 @@ from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
 
 def replay(source: str, duration_s: float | None, save_to: str) -> None:
     """Make the nodes, feed them, and say what came out."""
+    drive = open_input(source)  # a wrong path is said before any node starts
     rclpy.init(args=[])
     inside = overrides(threaded=False)  # work inside the callbacks: the same result on every run
-    nodes = [
-        cls(parameter_overrides=inside)
-        for cls in (LidarOdometryNode, LoopClosureNode, PoseGraphNode)
-    ]
+    classes = (LidarOdometryNode, LoopClosureNode, PoseGraphNode)
+    nodes = [cls(parameter_overrides=inside) for cls in classes]
     try:
-        LockStep(nodes).run(source, duration_s=duration_s)
+        LockStep(nodes).run(drive, duration_s=duration_s)
         graph = nodes[-1].map.graph
         accepted = sum(loop.status is LoopStatus.ACCEPTED for loop in graph.loops())
         sys.stdout.write(

@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from lcd_common.cloud import PointCloud
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
 from lcd_loop_closure.descriptor_index import Euclidean
 from lcd_loop_closure.lcdnet.checkpoint import load_network
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import thinned
 from lcd_loop_closure.lcdnet.voxels import Clouds

@@ -97,6 +97,11 @@ class SweepRegistration:
         self._searched = 1.0
         self.sweeps = 0
 
+    @property
+    def _polish_ends_it(self) -> bool:
+        """Whether the map's surfaces are known well enough to leave the end to the polish."""
+        return self.settings.polish and self.sweeps >= _RECENT
+
     def points(self) -> Array:
         """Return the points [N x 3] of the map, odom frame."""
         return self._kiss.points()
@@ -153,10 +158,10 @@ class SweepRegistration:
             guess: T_odom_middle to start from.
             prior: 6x6 information that keeps what the sweep does not tell.
             rough: for a guess that may be far off or wrong.
-            brief: leave the last centimetres to the polish, which is faster at it.
+            brief: thin, and leave the last centimetres to the polish, which is faster at it.
             thin: with a part of the points, for a pose that the polish will improve.
         """
-        source = sweep.source[::_THIN_SHARE] if thin else sweep.source
+        source = sweep.source[::_THIN_SHARE] if thin or brief else sweep.source
         T_kiss = self._kiss.align(source, guess, rough=rough, brief=brief)
         on_surfaces = self.polished(sweep, T_kiss, prior)
         disagreement = se3.log(se3.inverse(T_kiss) @ on_surfaces.T_odom_middle)
@@ -190,8 +195,8 @@ class SweepRegistration:
         usual = float(np.median(self._fitness)) if self._fitness else 0.0
         limit = max(self.settings.min_fitness, self.settings.min_fitness_ratio * usual)
         doubtful = max(limit, _DOUBTFUL * usual)
-        brief = self.settings.polish and self.sweeps >= _RECENT
-        fit = self.fit(sweep, guess, prior, brief=brief, thin=brief)
+        brief = self._polish_ends_it
+        fit = self.fit(sweep, guess, prior, brief=brief)
         if brief and fit.matches.fitness < doubtful:
             fit = self._once_more(sweep, fit, guess, prior, doubtful)
             fit = replace(fit, surprised=True)
@@ -240,7 +245,7 @@ class SweepRegistration:
         """Register anew from a turn that began or ended, and else as long as it takes."""
         turned = yaw_candidates(sweep.sample, [guess], self._surfaces, 1, _TURNS, _TURN_SPAN)[0]
         if se3.distance(guess, turned)[1] > 1e-6:
-            again = self.fit(sweep, turned, prior, brief=True, thin=True)
+            again = self.fit(sweep, turned, prior, brief=True)
             fit = max(fit, again, key=lambda one: one.matches.fitness)
         if fit.matches.fitness >= doubtful:
             return fit
@@ -248,5 +253,5 @@ class SweepRegistration:
 
     def _search(self, sweep: Sweep, centres: list[Array], prior: Array) -> list[tuple[Sweep, Fit]]:
         poses = yaw_candidates(sweep.sample, centres, self._surfaces, _HEADINGS)
-        thin = self.settings.polish and self.sweeps >= _RECENT
+        thin = self._polish_ends_it
         return [(sweep, self.fit(sweep, T, prior, rough=True, thin=thin)) for T in poses]

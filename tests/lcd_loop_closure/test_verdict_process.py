@@ -2,13 +2,11 @@
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from orphans import ends_with_its_parent
 from saved_maps import made_up_map
 
 from lcd_common import se3
@@ -90,24 +88,7 @@ def test_the_child_ends_when_its_parent_is_killed() -> None:
         'print(process._running().pid, flush=True)\n'
         'time.sleep(60)\n'
     )
-    parent = subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    child = int(parent.stdout.readline())
-    parent.kill()
-    parent.wait()
-    parent.stdout.close()
-    deadline = time.monotonic() + 20.0
-    while _runs(child) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not _runs(child)
-
-
-def _runs(pid: int) -> bool:
-    try:
-        with open(f'/proc/{pid}/stat') as file:
-            return file.read().rsplit(')', 1)[1].split()[0] != 'Z'
-    except FileNotFoundError:
-        return False
+    assert ends_with_its_parent(code)
 
 
 def test_verdicts_survive_their_arrays() -> None:

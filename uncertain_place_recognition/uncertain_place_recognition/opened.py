@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.reduction import ReductionConfig
 from uncertain_place_recognition.ensemble import EmbeddingEnsemble
 from uncertain_place_recognition.place_recognizer import PlaceRecognizer, PlaceRecognizerConfig

@@ -15,8 +15,8 @@ from cmrnet_ekf.evaluation.study import Study, study
 from cmrnet_ekf.evaluation.tables import localization, markdown
 from cmrnet_ekf.training.sample_set import SampleSet
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
-from lcd_loop_closure.lcdnet.device import choose_device
 
 RESULTS = 'results.json'
 _EXAMPLES = """

@@ -22,10 +22,10 @@ from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig
 from cmrnet_ekf.mapping.settings import MapConfig
 from cmrnet_ekf.networks.config import CmrnetConfig
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.setting_changes import changed
 from lcd_common.trajectory import read_tum
-from lcd_loop_closure.lcdnet.device import choose_device
 
 _EXAMPLES = """
 examples:

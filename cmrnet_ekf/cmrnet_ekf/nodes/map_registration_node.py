@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -37,6 +36,7 @@ from cmrnet_ekf.overlay import overlay
 from cmrnet_ekf.predictors import Predictor
 from cmrnet_ekf.rejection import traces
 from lcd_common import se3
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.nodes import messages, qos
 from lcd_common.nodes.diagnostics import Diagnostics
@@ -111,9 +111,7 @@ class MapRegistrationNode(Node):
                 '(train_cmrnet makes them)'
             )
         self._map = LocalMap(Path(c.map), local_map)
-        device = (
-            ('cuda' if torch.cuda.is_available() else 'cpu') if c.device == 'auto' else c.device
-        )
+        device = choose_device(c.device)
         self._stages = [Predictor.load(Path(path), device, c.samples) for path in weights]
         self.get_logger().info(f'{len(weights)} stages run on {device}')
         if self._stages[-1].kind == 'plain':

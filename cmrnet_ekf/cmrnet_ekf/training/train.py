@@ -22,9 +22,9 @@ from cmrnet_ekf.training.trainer import Trainer
 from cmrnet_ekf.training.validation import validate
 from cmrnet_ekf.training.variants import NETWORKS, VARIANTS, Variant, variant
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError
 from lcd_common.setting_changes import changed
-from lcd_loop_closure.lcdnet.device import choose_device
 
 _log = logging.getLogger(__name__)
 _EXAMPLES = """

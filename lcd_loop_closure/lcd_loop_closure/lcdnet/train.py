@@ -15,12 +15,12 @@ import torch
 from tqdm import tqdm
 
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.setting_changes import changed
 from lcd_loop_closure.lcdnet import checkpoint
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.config import COMPACT, FULL, LcdnetConfig
 from lcd_loop_closure.lcdnet.curves import draw_curves
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import PlaceShard, simulated_shard
 from lcd_loop_closure.lcdnet.training import Trainer, TrainingConfig

@@ -14,13 +14,13 @@ import torch
 from tqdm import tqdm
 
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError
 from lcd_common.setting_changes import changed
 from lcd_loop_closure.lcdnet import checkpoint
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
 from lcd_loop_closure.lcdnet.curves import draw_place_head
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.place_features import (
     PlaceFeatures,

@@ -8,10 +8,10 @@ import pytest
 import torch
 from lcdnet_samples import TINY, street_shard
 
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
 from lcd_loop_closure.lcdnet import Lcdnet, checkpoint, train
 from lcd_loop_closure.lcdnet.curves import draw_curves
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.lcdnet.training import Trainer, TrainingCollapsedError, TrainingConfig
 from lcd_loop_closure.lcdnet.validation import validate
 from lcd_loop_closure.lcdnet.voxels import Clouds

@@ -34,6 +34,7 @@ from visualization_msgs.msg import MarkerArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
+from lcd_common.device import choose_device
 from lcd_common.errors import DataError
 from lcd_common.nodes import messages, qos
 from lcd_common.nodes.diagnostics import Diagnostics
@@ -44,7 +45,6 @@ from lcd_common.nodes.worker import Worker
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
 from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
-from lcd_loop_closure.lcdnet.device import choose_device
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch

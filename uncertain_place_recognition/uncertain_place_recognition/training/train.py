@@ -13,9 +13,9 @@ import torch
 from tqdm import tqdm
 
 from lcd_common.command_line import run
+from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.setting_changes import changed
-from lcd_loop_closure.lcdnet.device import choose_device
 from uncertain_place_recognition.ensemble import BEST, PACKED, EmbeddingEnsemble
 from uncertain_place_recognition.networks.embedding import PlaceNetwork
 from uncertain_place_recognition.networks.shapes import build, shape
