@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common.errors import LocalizationError
+from lcd_common.priority import lower_priority
 from lcd_loop_closure.graph_arrays import arrays_of, snapshot_from
 from lcd_loop_closure.graph_snapshot import GraphSnapshot
 from lcd_loop_closure.robust_solver import RobustSolver, RobustSolverConfig, Verdict
@@ -160,7 +161,7 @@ def main() -> None:
     settings, niceness = sys.argv[1:]
     answers = os.fdopen(os.dup(sys.stdout.fileno()), 'wb')
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    os.nice(int(niceness))
+    lower_priority(int(niceness))
     with contextlib.suppress(BrokenPipeError):  # the caller is gone
         serve(RobustSolver(RobustSolverConfig(**json.loads(settings))), sys.stdin.buffer, answers)
 

@@ -18,7 +18,6 @@ its scan; one that it rejects is not registered with candidates by descriptor. P
 config/loop_closure.yaml or `ros2 param describe`.
 """
 
-import os
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -37,6 +36,7 @@ from lcd_common.nodes.parameters import declare_config
 from lcd_common.nodes.spin import run_node
 from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.nodes.worker import Worker
+from lcd_common.priority import lower_priority
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
 from lcd_loop_closure.keyframes import Keyframe, KeyframeConfig, KeyframeSelector
@@ -389,7 +389,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def make() -> Node:
         node = LoopClosureNode()
-        os.nice(node.config.niceness)
+        lower_priority(node.config.niceness)
         return node
 
     return run_node(make, __doc__ or '', argv)

@@ -21,7 +21,6 @@ Work is done beside the callbacks; when it cannot keep up, the oldest waiting sc
 Parameters: see config/place_recognition.yaml or `ros2 param describe`.
 """
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +41,7 @@ from lcd_common.nodes.parameters import declare_config
 from lcd_common.nodes.spin import run_node
 from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.nodes.worker import Worker
+from lcd_common.priority import lower_priority
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
 from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
@@ -392,7 +392,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def make() -> Node:
         node = PlaceRecognitionNode()
-        os.nice(node.config.niceness)
+        lower_priority(node.config.niceness)
         return node
 
     return run_node(make, __doc__ or '', argv)
