@@ -47,13 +47,13 @@ def out_and_back_live(work: Path) -> dict[str, Any]:
     assert truth is not None
     stamps = np.array(sorted(recorder.scan_published_ns), np.int64)
     odometry = _trajectory(recorder.T_odom_base)
-    corrected = corrected_trajectory(odometry, _trajectory(recorder.T_map_base))
+    corrected = corrected_trajectory(odometry, _trajectory(recorder.T_map_base()))
     after = trajectory_errors(corrected, truth)
     before = trajectory_errors(odometry, truth)
     keyframe_stamps = np.array(
         [recorder.keyframes[id].stamp_ns for id in sorted(recorder.keyframes)], np.int64
     )
-    loops = judge_loops(tuple(recorder.loops), keyframe_stamps, truth.stamps_ns, truth)
+    loops = judge_loops(tuple(recorder.loops()), keyframe_stamps, truth.stamps_ns, truth)
     latencies = np.array(recorder.latencies_ms())
     assert after is not None and before is not None
     return {

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bags.inputs import open_input
 from bags.simulation.drive import SimulatedDrive
 from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.stream import TEST_SEEDS
@@ -132,16 +133,16 @@ def live(work: Path, seconds: float = 600.0) -> dict[str, Any]:
         )  # fmt: skip
     result = run_live(bag, {'lidar_odometry': ['min_range:=2.0']}, work / 'town_live_log')
     recorder = result.recorder
-    sent = recorder.scan_published_ns
+    scans = next(one.count for one in open_input(bag).streams() if one.topic.endswith('points'))
     latencies = np.array(recorder.latencies_ms())
     return {
         'live_10hz': {
-            'scans': len(sent),
-            'seconds': 0.1 * len(sent),
-            'odometry_lost': len(sent) - len(recorder.odometry_published_ns),
+            'scans': scans,
+            'seconds': 0.1 * scans,
+            'odometry_lost': scans - len(recorder.odometry_published_ns),
             'odometry_latency_p50_ms': float(np.percentile(latencies, 50)),
             'odometry_latency_p99_ms': float(np.percentile(latencies, 99)),
             'keyframes': len(recorder.keyframes),
-            'loops_accepted': sum(loop.status.name == 'ACCEPTED' for loop in recorder.loops),
+            'loops_accepted': sum(loop.status.name == 'ACCEPTED' for loop in recorder.loops()),
         }
     }

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from lcd_common import se3
@@ -30,8 +31,7 @@ class LiveRecorder(Node):
         self.T_odom_base: dict[int, se3.Array] = {}
         self.keyframes: dict[int, Keyframe] = {}
         self.candidates: list[LoopConstraint] = []
-        self.loops: list[LoopConstraint] = []
-        self.T_map_base: dict[int, se3.Array] = {}
+        self._loops = self._path = b''
         self.create_subscription(
             PointCloud2, 'points', self.on_points, qos.SENSOR_RELIABLE, raw=True
         )
@@ -40,8 +40,9 @@ class LiveRecorder(Node):
         self.create_subscription(
             LoopConstraintMessage, 'loop_constraint', self.on_loop_constraint, qos.RELIABLE
         )
-        self.create_subscription(LoopConstraintArray, 'loops', self.on_loops, qos.LATCHED)
-        self.create_subscription(Path, 'path', self.on_path, qos.LATCHED)
+        # They grow with the drive and only the last one counts: read when the drive is over.
+        self.create_subscription(LoopConstraintArray, 'loops', self.on_loops, qos.LATCHED, raw=True)
+        self.create_subscription(Path, 'path', self.on_path, qos.LATCHED, raw=True)
 
     def on_points(self, serialized: bytes, info: Mapping[str, int]) -> None:
         """Note when a scan was published; only the stamp is read from its bytes."""
@@ -65,15 +66,28 @@ class LiveRecorder(Node):
         """Remember what the detector said of a candidate."""
         self.candidates.append(loop_from_message(message))
 
-    def on_loops(self, message: LoopConstraintArray) -> None:
-        """Remember the graph's latest verdicts."""
-        self.loops = [loop_from_message(loop) for loop in message.loops]
+    def on_loops(self, serialized: bytes) -> None:
+        """Keep the graph's latest verdicts."""
+        self._loops = serialized
 
-    def on_path(self, message: Path) -> None:
-        """Remember the corrected trajectory."""
-        self.T_map_base = {
+    def on_path(self, serialized: bytes) -> None:
+        """Keep the corrected trajectory."""
+        self._path = serialized
+
+    def loops(self) -> list[LoopConstraint]:
+        """Return the graph's last verdicts; none without any."""
+        if not self._loops:
+            return []
+        message = deserialize_message(self._loops, LoopConstraintArray)
+        return [loop_from_message(loop) for loop in message.loops]
+
+    def T_map_base(self) -> dict[int, se3.Array]:
+        """Return the last corrected trajectory by stamp; empty without any."""
+        if not self._path:
+            return {}
+        return {
             messages.stamp_ns(pose.header.stamp): messages.transform_from_pose(pose.pose)
-            for pose in message.poses
+            for pose in deserialize_message(self._path, Path).poses
         }
 
     def latencies_ms(self) -> list[float]:
