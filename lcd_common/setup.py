@@ -1,7 +1,5 @@
 """Install lcd_common: colcon and pip both read this file."""
 
-from glob import glob
-
 from setuptools import find_packages, setup
 
 NAME = 'lcd_common'
@@ -15,7 +13,7 @@ setup(
     maintainer_email='maintainers@example.com',
     license='MIT',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', '**/*.html', '**/*.json']},
+    package_data={NAME: ['py.typed', '**/*.html', '**/*.json', '**/*.xml']},
     python_requires='>=3.11',
     # requirements/ pins everything; the suite's own packages are named in package.xml alone,
     # because pip would look for packages of these names elsewhere.
@@ -24,7 +22,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{NAME}/config', [f'{NAME}/fast_dds.xml']),
     ],
     entry_points={
         'console_scripts': [],

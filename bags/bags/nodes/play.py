@@ -27,6 +27,7 @@ from bags.read_ahead import ReadAhead
 from bags.records import Drive
 from bags.topics import TF_STATIC_TOPIC
 from lcd_common.errors import DataError
+from lcd_common.nodes.large_messages import carry_large_messages
 
 _READ_AHEAD_BYTES = 48_000_000  # two seconds and more of a dense LiDAR with a camera
 _POINTS = 'sensor_msgs/msg/PointCloud2'
@@ -228,6 +229,7 @@ def play_on_ros(
 ) -> int:
     """Play a drive as a node of its own and say how it went; returns the exit status."""
     source = source_of(drive, topics)
+    carry_large_messages()
     rclpy.init(args=['bags', *ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = Node('bag_player', enable_rosout=False, start_parameter_services=False)

@@ -8,6 +8,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from lcd_common.errors import LocalizationError
+from lcd_common.nodes.large_messages import carry_large_messages
 
 
 def spin(*nodes: Node) -> None:
@@ -36,6 +37,7 @@ def run_node(make: Callable[[], Node], help_text: str, argv: list[str] | None = 
     if '-h' in arguments or '--help' in arguments:
         sys.stdout.write(help_text.rstrip() + '\n')
         return 0
+    carry_large_messages()
     try:
         rclpy.init(args=[sys.argv[0], *arguments])
     except RuntimeError as error:  # rcl's own: a parameter file that cannot be read, a bad remap
