@@ -1,11 +1,14 @@
 """Clouds need more shared memory than Fast DDS takes by itself; a user's own choice stays."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from lcd_common.nodes import large_messages
 
 _VARIABLES = (
     'FASTRTPS_DEFAULT_PROFILES_FILE',
@@ -41,6 +44,13 @@ def _run(code: str, folder: Path, **variables: str) -> str:
     return run.stdout.strip()
 
 
+_NEEDS_MEMORY = pytest.mark.skipif(
+    not Path('/dev/shm').is_dir() or shutil.disk_usage('/dev/shm').free < 256 << 20,
+    reason='needs 256 MB of shared memory',
+)
+
+
+@_NEEDS_MEMORY
 def test_the_profile_is_chosen_where_the_user_chose_nothing(tmp_path: Path) -> None:
     chosen, path = _run(_CHOOSE, tmp_path).split()
     assert chosen == 'True' and path.endswith('fast_dds.xml') and Path(path).is_file()
@@ -66,6 +76,21 @@ def test_a_profile_in_the_folder_stays(tmp_path: Path) -> None:
     assert _run(_CHOOSE, tmp_path) == 'False -'
 
 
+def test_little_shared_memory_is_left_to_the_default(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in _VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    free = shutil.disk_usage(tmp_path)._replace(free=64 << 20)
+    monkeypatch.setattr(shutil, 'disk_usage', lambda _: free)
+    assert not large_messages.carry_large_messages()
+    monkeypatch.setattr(large_messages, '_SHARED_MEMORY', tmp_path / 'none')
+    assert not large_messages.carry_large_messages()
+    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in os.environ
+
+
+@_NEEDS_MEMORY
 @pytest.mark.ros
 def test_the_segment_holds_several_sweeps(tmp_path: Path) -> None:
     sweep = 130_000 * 16
