@@ -62,6 +62,25 @@ def test_a_kitti_folder_reads_as_it_was_driven(tmp_path: Path) -> None:
     assert not list((root / 'sequences').glob('.*'))
 
 
+def test_blocked_sectors_have_no_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`--blocked` as a user types it, twice; the drive is not written, one sweep tells."""
+    driven: list[SimulatedDrive] = []
+
+    def keep(drive: SimulatedDrive, *_: object, **__: object) -> dict[str, int]:
+        driven.append(drive)
+        return {}
+
+    monkeypatch.setattr('bags.simulate.convert', keep)
+    sectors = ['--blocked', '-45', '45', '--blocked', '145', '215']
+    assert main([*SHORT, *sectors, '--out', 'x.mcap']) == 0
+    xyz = driven[0].scan(0).cloud.xyz
+    azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
+    # A beam's own error of azimuth is far below a degree.
+    assert np.abs(azimuth).min() > 44.0 and np.abs(azimuth).max() < 146.0
+    by_ten_degrees = np.histogram(np.abs(azimuth), np.arange(45.0, 146.0, 10.0))[0]
+    assert by_ten_degrees.min() > 200
+
+
 def test_a_town_is_an_input() -> None:
     named = open_input('town:3:1')
     assert (named.name, open_input('town').name) == ('town_3_run1', 'town_99_run0')
@@ -76,6 +95,9 @@ def test_a_town_is_an_input() -> None:
         (['--length', '5', '--out', 'x'], 'at least 50 m, got 5'),
         (['--reverse', '2', '--out', 'x'], 'at most 0.9'),
         (['--sensor', 'hdl65', '--out', 'x'], 'a lidar is one of'),
+        (['--blocked', '0', '360', '--out', 'x'], 'less than 360'),
+        (['--blocked', '0', '180', '--blocked', '180', '0', '--out', 'x'], 'nothing to see'),
+        (['--blocked', '0', 'nan', '--out', 'x'], 'blocked takes the azimuths'),
         (['--imu', 'xsens', '--out', 'x'], 'an imu is one of'),
         (['--style', 'baroque', '--out', 'x'], 'a style is one of'),
         (['--format', 'kitti', '--imu', '--out', 'x'], 'no place for --imu'),

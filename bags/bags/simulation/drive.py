@@ -25,12 +25,13 @@ from bags.simulation.inertial import InertialLog, felt, imu_model, measured
 from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.journey import Journey
 from bags.simulation.lidar import LidarSensor, LidarSweep
-from bags.simulation.lidar_model import lidar_model
+from bags.simulation.lidar_model import LidarModel, lidar_model
 from bags.simulation.road_users import kept_clear
 from bags.simulation.satellites import ReceiverConfig, Reception, geodetic, receive
 from bags.simulation.town import SimulatedTown
 from bags.topics import ORDER, TOPICS
 from lcd_common import se3
+from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
 from lcd_common.trajectory import Trajectory
 
@@ -40,6 +41,12 @@ class SensorsConfig:
     """What the simulated car carries."""
 
     lidar: str = setting('hdl64', 'model of the LiDAR (bags.simulation.lidar_model)')
+    blocked: tuple[float, ...] = setting(
+        (),
+        'azimuths of sectors in which something blocks the LiDAR: begin, end, begin, end ..., '
+        'counter-clockwise from straight ahead',
+        unit='deg',
+    )
     point_time: bool = setting(
         False, 'sweep while driving and give each point its time; off: sweeps are deskewed'
     )
@@ -75,13 +82,13 @@ class SimulatedDrive:
             receiver: the satellite receiver.
 
         Raises:
-            ConfigError: there is no LiDAR or inertial unit of that name.
+            ConfigError: there is no LiDAR or inertial unit of that name, or the LiDAR sees nothing.
         """
         self.town = SimulatedTown(town) if isinstance(town, int) else town
         self.run = run
         self.sensors = sensors or SensorsConfig()
         self._receiver = receiver or ReceiverConfig()
-        self.lidar = lidar_model(self.sensors.lidar)
+        self.lidar = _partly_blocked(lidar_model(self.sensors.lidar), self.sensors.blocked)
         self._imu_model = imu_model(self.sensors.imu) if self.sensors.imu else None
         self.name = f'town_{self.town.seed}_run{run}'
         self.path = Path(self.name)
@@ -228,6 +235,21 @@ class SimulatedDrive:
 
     def _time_s(self, stamps_ns: NDArray[np.int64]) -> se3.Array:
         return np.asarray((stamps_ns - self._stamp(0.0)) * 1e-9, np.float64)
+
+
+def _partly_blocked(model: LidarModel, azimuths_deg: tuple[float, ...]) -> LidarModel:
+    begins, ends = azimuths_deg[::2], azimuths_deg[1::2]
+    if len(begins) != len(ends) or not np.isfinite(azimuths_deg).all():
+        raise ConfigError(
+            'blocked takes the azimuths of the begin and the end of each sector, degrees '
+            f'counter-clockwise from straight ahead, got {azimuths_deg}'
+        )
+    model = model.blocked(*model.blocked_deg, *zip(begins, ends, strict=True))
+    if any((end - begin) % 360.0 == 0.0 for begin, end in model.blocked_deg):
+        raise ConfigError(f'blocked sectors are wider than 0 and less than 360, got {azimuths_deg}')
+    if not model.open_columns().any():
+        raise ConfigError(f'the blocked sectors {azimuths_deg} leave the LiDAR nothing to see')
+    return model
 
 
 def _entries(

@@ -23,7 +23,7 @@ class Journey:
     """The motion of base_link during one drive, from rest to rest.
 
     Attributes:
-        plan: the streets driven, and the shares of revisits that came out.
+        plan: the streets driven, with the metres and the shares of revisits that came out.
         path: the line driven.
         duration_s: of the drive.
     """
@@ -47,8 +47,9 @@ class Journey:
         """
         settings = settings or JourneyConfig()
         rng = np.random.default_rng([seed, 22, run])
-        self.plan: Itinerary = itinerary(streets, settings, seed)
-        self.path: Path = lay_path(streets, self.plan, settings, rng)
+        planned = itinerary(streets, settings, seed)
+        self.path: Path = lay_path(streets, planned, settings, rng)
+        self.plan: Itinerary = planned.driven(self.path.leg_m().tolist())
         self._ground = ground
         self._suspension = Suspension(np.random.default_rng([seed, _SEED_OF_SUSPENSION]))
         steps = np.linalg.norm(np.diff(self.path.xy, axis=0), axis=1)

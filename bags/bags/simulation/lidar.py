@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from bags.simulation.hits import Hits
 from bags.simulation.lidar_measurement import (
     Surfaces,
-    beam_directions,
     beam_errors,
+    calibrated_directions,
     draw,
     measure,
     neighbours,
@@ -69,7 +69,7 @@ class LidarSensor:
         self.model, self._caster = model, caster
         self._shape = (model.columns, len(model.elevation_rad))
         self._directions = model.directions().astype(np.float32)
-        self._beams = beam_directions(model, seed)
+        self._calibrated = calibrated_directions(model, seed).reshape(-1, 3)
         self._open = np.flatnonzero(model.open_columns())
         self._beam_error_m = beam_errors(model, seed)
 
@@ -101,7 +101,7 @@ class LidarSensor:
         returned[blocked] = False
         ray = np.flatnonzero(returned)
         surface = np.where(echoes.of_neighbour.ravel()[ray], near.index.ravel()[ray], ray)
-        xyz = self._directions.reshape(-1, 3)[ray] * echoes.range_m.ravel()[ray, None]
+        xyz = self._calibrated[ray] * echoes.range_m.ravel()[ray, None]
         intensity = echoes.intensity.ravel()[ray] if self.model.has_intensity else None
         at = self.model.column_time_s()[ray // self._shape[1]].astype(np.float32)
         cloud = PointCloud(xyz.astype(np.float32), intensity, at if moving else None)
@@ -128,10 +128,10 @@ class LidarSensor:
         for part, at in zip(parts, times, strict=True):
             T = T_world_lidar.astype(np.float32)
             if T.ndim == 2:
-                directions = self._beams[part] @ T[:3, :3].T
+                directions = self._directions[part] @ T[:3, :3].T
                 origins = T[None, :3, 3]
             else:
-                directions = self._beams[part] @ T[part, :3, :3].swapaxes(1, 2)
+                directions = self._directions[part] @ T[part, :3, :3].swapaxes(1, 2)
                 origins = np.repeat(T[part, :3, 3], beams, axis=0)
             hits = self._caster.cast(origins, directions.reshape(-1, 3), at)
             rays = (part[:, None] * beams + np.arange(beams)).ravel()

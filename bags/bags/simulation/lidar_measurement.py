@@ -113,18 +113,18 @@ def beam_errors(model: LidarModel, seed: int) -> NDArray[np.float32]:
     return rng.normal(0.0, model.beam_sigma_m, len(model.elevation_rad)).astype(np.float32)
 
 
-def beam_directions(model: LidarModel, seed: int) -> NDArray[np.float32]:
-    """Return where the beams of one sensor really point [C x B x 3], lidar frame.
+def calibrated_directions(model: LidarModel, seed: int) -> NDArray[np.float32]:
+    """Return where the calibration of one sensor says its beams point [C x B x 3], lidar frame.
 
-    Its points are computed with the directions of the model, as by a calibration that is not
-    perfect.
+    They really point along the directions of the model; points are computed with these, and no
+    calibration is perfect.
     """
     rng = np.random.default_rng([seed, 62])
     up, left = rng.normal(0.0, model.angle_sigma_rad, (2, len(model.elevation_rad)))
-    up = up + model.elevation_bias_rad
-    azimuth = model.azimuth_rad()[:, None] + left
-    level = np.cos(model.elevation_rad + up)
-    z = np.broadcast_to(np.sin(model.elevation_rad + up), azimuth.shape)
+    elevation = model.elevation_rad - up - model.elevation_bias_rad
+    azimuth = model.azimuth_rad()[:, None] - left
+    level = np.cos(elevation)
+    z = np.broadcast_to(np.sin(elevation), azimuth.shape)
     return np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, z], axis=-1).astype(
         np.float32
     )

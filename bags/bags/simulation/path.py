@@ -7,14 +7,13 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from bags.simulation.itinerary import Itinerary, JourneyConfig, Leg
+from bags.simulation.lane import corner_m, farthest_right_m, lane_m
 from bags.simulation.street_map import StreetEdge, StreetMap
 from lcd_common import se3
 
 STEP_M = 0.25
-_CORNER_M = 7.5  # streets are left this far before their crossings, past the last parked cars
 _DEAD_END_M = 6.0
 _SMOOTH_M = 1.0
-_HALF_CAR_M = 0.95
 
 
 @dataclass(frozen=True)
@@ -31,16 +30,10 @@ class Path:
     leg: np.ndarray
     ends: np.ndarray
 
-
-def lane_m(edge: StreetEdge) -> float:
-    """Return how far right of the centreline cars drive: clear of those parked at the kerb."""
-    return float(np.clip(edge.half_width_m - 3.2, 1.3, 1.75))
-
-
-def _farthest_right_m(edge: StreetEdge) -> float:
-    """Return how far right a car may drive: nobody parks in streets narrower than 8 m."""
-    parked = 2.3 if edge.half_width_m >= 4.0 else 0.3
-    return max(edge.half_width_m - parked - _HALF_CAR_M, 1.2)
+    def leg_m(self) -> se3.Array:
+        """Return the metres driven on each leg [K] of the itinerary, up to the last one reached."""
+        steps = np.linalg.norm(np.diff(self.xy, axis=0), axis=1)
+        return np.asarray(np.bincount(self.leg[:-1], steps), np.float64)
 
 
 def lay_path(
@@ -77,7 +70,7 @@ def _strip(
     line = edge.centreline if leg.forward else edge.centreline[::-1]
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     spline = CubicSpline(s, line)
-    cut = min(_CORNER_M, 0.35 * s[-1])
+    cut = corner_m(edge)
     end = min(_DEAD_END_M, cut) if leg.turns_back else cut
     at = np.linspace(cut, s[-1] - end, max(8, round((s[-1] - cut - end) / STEP_M)))
     along = spline(at, 1)
@@ -92,7 +85,7 @@ def _strip(
         rng.uniform(0.02, 0.07) * np.sin(2 * np.pi * (at / rng.uniform(35.0, 110.0) + rng.random()))
         for _ in range(3)
     )
-    shifts = np.clip(aside + wander, 0.0, _farthest_right_m(edge))
+    shifts = np.clip(aside + wander, 0.0, farthest_right_m(edge))
     return np.asarray(spline(at) + shifts[:, None] * right)
 
 

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from bags.simulation.lidar_measurement import calibrated_directions
 from bags.simulation.lidar_model import LidarModel
 from bags.simulation.scene import Scene
 from bags.street.mesh import MOVING
@@ -60,7 +61,10 @@ class LidarRaster:
         Raises:
             ConfigError: its beams do not come from top to bottom.
         """
+        if model is getattr(self, 'model', None):
+            return
         self.model = model
+        self._calibrated: dict[int, torch.Tensor] = {}
         directions = np.ascontiguousarray(model.directions().reshape(-1, 3), np.float32)
         self._directions = self._on_device(directions)
         tangent = np.tan(model.elevation_rad)
@@ -72,6 +76,12 @@ class LidarRaster:
     def directions(self) -> torch.Tensor:
         """Unit vectors [C x B x 3] of the rays, lidar frame."""
         return self._directions.view(self.model.columns, -1, 3)
+
+    def calibrated(self, seed: int) -> torch.Tensor:
+        """Return where the calibration of one sensor says the rays point [C x B x 3]."""
+        if seed not in self._calibrated:
+            self._calibrated[seed] = self._on_device(calibrated_directions(self.model, seed))
+        return self._calibrated[seed]
 
     def cast(self, T_world_lidar: np.ndarray, time_s: float = 0.0) -> RasterHits:
         """Return what a sweep taken at one pose [4 x 4] and time hits."""

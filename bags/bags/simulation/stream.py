@@ -255,10 +255,11 @@ def measured_sweep(
         torch.as_tensor(near.index, device=device),
         torch.as_tensor(near.spacing_rad, device=device),
     )
-    beam_error_m = torch.as_tensor(beam_errors(model, int(rng.integers(8))), **to_device)  # type: ignore[call-overload]
+    seed = int(rng.integers(8))
+    beam_error_m = torch.as_tensor(beam_errors(model, seed), **to_device)  # type: ignore[call-overload]
     draws = Draws(normal[0], normal[1], uniform[0], uniform[1])
     echoes = measure(surfaces, near, draws, model, beam_error_m, torch)
     returned = torch.isfinite(echoes.range_m)
     returned &= torch.as_tensor(model.open_columns(), device=device)[:, None]
-    xyz = raster.directions[returned] * echoes.range_m[returned][:, None]
+    xyz = raster.calibrated(seed)[returned] * echoes.range_m[returned][:, None]
     return xyz, echoes.intensity[returned]

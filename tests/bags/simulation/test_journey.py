@@ -1,18 +1,20 @@
 """Drives revisit as asked, stay on their streets and move as a car can."""
 
-from collections import Counter
+from collections import Counter, defaultdict
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from bags.simulation.itinerary import JourneyConfig, itinerary
+from bags.simulation.demonstration import demonstration
+from bags.simulation.itinerary import JourneyConfig, Leg
 from bags.simulation.journey import Journey
-from bags.simulation.path import lane_m
-from bags.simulation.street_map import street_map
+from bags.simulation.lane import lane_m
+from bags.simulation.street_map import StreetMap, street_map
 from bags.street.town import Ground
 from lcd_common import se3
-from lcd_loop_closure.revisits import RevisitConfig, true_loops
+from lcd_loop_closure.revisits import RevisitConfig, count_revisits, true_loops
 
 GROUND = Ground(np.random.default_rng(1))
 
@@ -49,6 +51,7 @@ def revisits(T: se3.Array) -> dict[str, float]:
 def test_revisits_come_out_as_asked(same_way: float, reverse: float) -> None:
     for seed in (3, 100):
         journey = drive(seed, length=1500.0, same_way=same_way, reverse=reverse)
+        assert sum(journey.plan.metres) == pytest.approx(1500.0, abs=12.0)
         assert journey.plan.same_way == pytest.approx(same_way, abs=0.06)
         assert journey.plan.reverse == pytest.approx(reverse, abs=0.06)
         counted = revisits(metre_by_metre(journey))
@@ -57,16 +60,61 @@ def test_revisits_come_out_as_asked(same_way: float, reverse: float) -> None:
         assert counted.get('reverse', 0.0) == pytest.approx(reverse, abs=0.1)
 
 
-def test_crossings_are_passed_again_on_other_streets() -> None:
-    wanted = JourneyConfig(length=2500.0, crossing=0.15, same_way=0.1, reverse=0.0)
-    without = JourneyConfig(length=2500.0, crossing=0.0, same_way=0.1, reverse=0.0)
-    shares = np.array(
-        [
-            [itinerary(street_map(seed), each, seed).crossing for each in (wanted, without)]
-            for seed in range(4)
-        ]
-    )
-    assert shares[:, 0].mean() > 0.05 > shares[:, 1].mean()
+def cut(one: se3.Array, other: se3.Array) -> bool:
+    """Tell whether two straight lines [2 x 2] intersect: each has its ends beside the other."""
+
+    def sides(line: se3.Array, points: se3.Array) -> float:
+        along, away = line[1] - line[0], points - line[0]
+        return float(np.prod(along[0] * away[:, 1] - along[1] * away[:, 0]))
+
+    return sides(one, other) < 0.0 and sides(other, one) < 0.0
+
+
+def recounted_crossings(streets: StreetMap, legs: tuple[Leg, ...]) -> float:
+    """Recount the share of crossings passed before on other streets, right across."""
+    passed: dict[int, list[tuple[set[int], se3.Array]]] = defaultdict(list)
+    count = 0
+    for leg, following in pairwise(legs):
+        if leg.turns_back:
+            continue
+        lines = [streets.edges[leg.edge].centreline, streets.edges[following.edge].centreline]
+        came = lines[0] if leg.forward else lines[0][::-1]
+        goes = lines[1] if following.forward else lines[1][::-1]
+        # As far from the crossing on all streets, else a long one may pass a short one's end.
+        ends = np.array([came[-4] - came[-1], goes[3] - goes[0]])
+        ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+        node = streets.edges[leg.edge].j if leg.forward else streets.edges[leg.edge].i
+        here = {leg.edge, following.edge}
+        is_new = all(not here & before for before, _ in passed[node])
+        count += is_new and any(cut(ends, line) for _, line in passed[node])
+        passed[node].append((here, ends))
+    return count / (len(legs) - 1)
+
+
+def test_the_more_crossings_are_asked_for_the_more_are_passed_again() -> None:
+    shares, of_the_way = [], []
+    for crossing in (0.0, 0.05, 0.1):
+        journeys = [drive(seed, length=1500.0, crossing=crossing) for seed in range(6)]
+        for seed, journey in enumerate(journeys):
+            recounted = recounted_crossings(street_map(seed), journey.plan.legs)
+            assert journey.plan.crossing == pytest.approx(recounted)
+        shares.append(np.mean([journey.plan.crossing for journey in journeys]))
+        counted = [revisits(metre_by_metre(journey)) for journey in journeys]
+        of_the_way.append(np.mean([each.get('crossing', 0.0) for each in counted]))
+    assert shares[0] < 0.01 and shares[1] == pytest.approx(0.05, abs=0.015) and shares[2] > 0.065
+    assert of_the_way[0] < of_the_way[1] < of_the_way[2]
+
+
+def test_the_demonstration_shows_streets_again_both_ways() -> None:
+    shown = demonstration()
+    assert 60.0 < shown.journey.duration_s < 80.0
+    plan, counted = shown.journey.plan, revisits(metre_by_metre(shown.journey))
+    for share, by_pose in ((plan.same_way, 'same_way'), (plan.reverse, 'reverse')):
+        assert share > 0.12 and counted[by_pose] > 0.12
+        assert counted[by_pose] == pytest.approx(share, abs=0.05)
+    scans = count_revisits(shown.truth().T_world_body)
+    assert scans.loops > 0.24 * scans.scans
+    assert scans.reverse_share is not None and 0.2 < scans.reverse_share < 0.8
 
 
 def test_it_is_as_long_as_asked_and_ends_at_rest() -> None:
@@ -118,8 +166,8 @@ def test_runs_drive_the_same_streets_in_their_own_way() -> None:
     first, again, second = drive(3), drive(3), drive(3, run=1)
     at = np.linspace(0.0, 100.0, 50)
     np.testing.assert_array_equal(first.T_world_base(at), again.T_world_base(at))
-    assert first.plan == second.plan
+    assert first.plan.legs == second.plan.legs
     away = cKDTree(first.path.xy).query(second.path.xy)[0]
     assert 0.01 < np.median(away) < 2.0
     assert first.duration_s != second.duration_s
-    assert drive(4).plan != first.plan
+    assert drive(4).plan.legs != first.plan.legs

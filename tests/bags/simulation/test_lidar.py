@@ -13,7 +13,7 @@ from bags.street.mesh import Label, Material, Mesh, MeshBuilder
 from lcd_common import se3
 
 # With a perfect calibration: where points lie is then a matter of noise alone.
-MODEL = replace(lidar_model('hdl64'), columns=900, angle_sigma_rad=0.0, elevation_bias_rad=0.0)
+MODEL = replace(lidar_model('hdl64'), columns=900, angle_sigma_rad=0.0)
 
 
 def room() -> Mesh:

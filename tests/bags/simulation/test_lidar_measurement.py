@@ -8,8 +8,8 @@ import pytest
 from bags.simulation.lidar_measurement import (
     Echoes,
     Surfaces,
-    beam_directions,
     beam_errors,
+    calibrated_directions,
     draw,
     measure,
     neighbours,
@@ -50,15 +50,16 @@ def test_beams_of_another_sensor_err_otherwise() -> None:
     assert not np.array_equal(errors[0], errors[1])
 
 
-def test_beams_point_where_the_calibration_almost_says() -> None:
-    true = np.array([beam_directions(HDL64, seed)[::200] for seed in range(60)], np.float64)
-    angle = np.arcsin(true[..., 2]) - HDL64.elevation_rad
-    assert angle.std() == pytest.approx(HDL64.angle_sigma_rad, rel=0.05)
-    assert angle.mean() == pytest.approx(HDL64.elevation_bias_rad, rel=0.05)
-    azimuth = np.arctan2(true[..., 1], true[..., 0]) - HDL64.azimuth_rad()[::200, None]
-    assert np.angle(np.exp(1j * azimuth)).std() == pytest.approx(HDL64.angle_sigma_rad, rel=0.05)
-    np.testing.assert_allclose(np.linalg.norm(true, axis=-1), 1.0, atol=1e-6)
-    ideal = beam_directions(replace(HDL64, angle_sigma_rad=0.0, elevation_bias_rad=0.0), 1)
+def test_the_calibration_almost_says_where_beams_point() -> None:
+    kitti = lidar_model('hdl64_kitti')
+    said = np.array([calibrated_directions(kitti, seed)[::200] for seed in range(60)], np.float64)
+    angle = kitti.elevation_rad - np.arcsin(said[..., 2])
+    assert angle.std() == pytest.approx(kitti.angle_sigma_rad, rel=0.05)
+    assert angle.mean() == pytest.approx(kitti.elevation_bias_rad, rel=0.05)
+    azimuth = np.arctan2(said[..., 1], said[..., 0]) - kitti.azimuth_rad()[::200, None]
+    assert np.angle(np.exp(1j * azimuth)).std() == pytest.approx(kitti.angle_sigma_rad, rel=0.05)
+    np.testing.assert_allclose(np.linalg.norm(said, axis=-1), 1.0, atol=1e-6)
+    ideal = calibrated_directions(replace(HDL64, angle_sigma_rad=0.0), 1)
     np.testing.assert_allclose(ideal, HDL64.directions(), atol=1e-6)
 
 

@@ -136,6 +136,57 @@ def test_two_sweeps_of_one_place_overlap_within_the_noise() -> None:
     assert abs(np.median(off)) < 0.3 * sigma
 
 
+def test_road_seen_from_afar_lies_where_it_lies() -> None:
+    """The same road from 5 to 10 m and from 25 to 35 m away, by true poses."""
+    dense = make(sensors=SensorsConfig(lidar='hdl64', imu='', gnss=False))
+    truth = dense.truth().T_world_body
+    off: list[np.ndarray] = []
+    for index in range(40, len(truth) - 1, 40):
+        gone = np.linalg.norm(truth[:index, :3, 3] - truth[index, :3, 3], axis=1)
+        before = int(np.argmin(np.abs(gone - 30.0)))
+        roads = []
+        for at, least, most in ((index, 5.0, 10.0), (before, 25.0, 35.0)):
+            sweep = dense.sweep(at)
+            range_m = np.linalg.norm(sweep.cloud.xyz, axis=1)
+            chosen = (sweep.label == Label.ROAD) & (range_m > least) & (range_m < most)
+            T = truth[at] @ car.LIDAR.T_parent_child
+            roads.append(se3.transform_points(T, sweep.cloud.xyz[chosen].astype(float)))
+        if min(map(len, roads)) < 20:
+            continue
+        away, nearest = cKDTree(roads[0][:, :2]).query(roads[1][:, :2], distance_upper_bound=0.3)
+        met = np.isfinite(away)
+        off.append(roads[1][met, 2] - roads[0][nearest[met], 2])
+    heights = np.concatenate(off)
+    assert len(heights) > 200
+    assert abs(np.median(heights)) < dense.lidar.range_sigma_m
+
+
+def test_edges_of_the_image_are_those_of_the_sweep() -> None:
+    """A point lies at the depth of its pixel; shifted by two pixels fewer do."""
+    sensors = SensorsConfig(lidar='hdl64', imu='', gnss=False, camera=True)
+    drive = make(sensors=sensors)
+    assert drive.camera is not None
+    renderer, share = drive._renderer, []
+    for index in (60, 160):
+        T_world_body = drive.truth().T_world_body[index]
+        view = renderer.view(T_world_body @ car.CAMERA.T_parent_child, drive.camera, 0.1 * index)
+        cloud = drive.sweep(index).cloud
+        T = se3.inverse(car.CAMERA.T_parent_child) @ car.LIDAR.T_parent_child
+        xyz = se3.transform_points(T, cloud.xyz.astype(float))
+        ahead = xyz[xyz[:, 2] > 2.0]
+        pixel = ahead @ drive.camera.K.T
+        pixel = pixel[:, :2] / pixel[:, 2:]
+        for shift in (0, -2, 2):
+            u, v = np.round(pixel + np.array([0, shift])).astype(int).T
+            inside = (u >= 0) & (v >= 2) & (u < drive.camera.width) & (v < drive.camera.height - 2)
+            depth = view.depth_m[v[inside], u[inside]]
+            near = np.abs(depth - ahead[inside, 2]) < 0.03 * ahead[inside, 2]
+            share.append(float(near.mean()))
+    whole, up, down = np.array(share).reshape(-1, 3).T
+    assert whole.min() > 0.85, whole
+    assert (whole > np.maximum(up, down) + 0.02).all()
+
+
 def test_the_car_stands_on_the_road(drive: SimulatedDrive) -> None:
     for index in (50, 150, 250):
         sweep = drive.sweep(index)

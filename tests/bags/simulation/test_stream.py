@@ -10,6 +10,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from bags.simulation.embree import EmbreeCaster
+from bags.simulation.lidar import LidarSensor
+from bags.simulation.lidar_model import lidar_model
+from bags.simulation.raster import LidarRaster
 from bags.simulation.reflectivity import patchiness
 from bags.simulation.stream import (
     TEST_SEEDS,
@@ -17,7 +21,9 @@ from bags.simulation.stream import (
     VALIDATION_SEEDS,
     StreamConfig,
     SweepStream,
+    measured_sweep,
 )
+from bags.simulation.town import SimulatedTown
 from lcd_common.errors import ConfigError
 
 SMALL = StreamConfig(sensors=('vlp16', 'os1_64'), sweeps_per_town=8, towns_held=1, runs=2)
@@ -62,6 +68,30 @@ def test_places_hold_sweeps_as_far_apart_as_asked(caster: str) -> None:
             assert 1.6 <= sweep.height_m <= 1.9
             below = sweep.xyz.numpy()[np.linalg.norm(sweep.xyz.numpy()[:, :2], axis=1) < 8.0, 2]
             assert abs(float(np.percentile(below, 5)) + sweep.height_m) < 0.35
+
+
+def test_both_casters_measure_with_the_same_calibration() -> None:
+    """Without noise both renderers give the same points, put too low by the elevation's bias."""
+    model = replace(
+        lidar_model('hdl64_kitti'), columns=180, range_sigma_m=0.0, beam_sigma_m=0.0,
+        angle_sigma_rad=0.0,
+    )  # fmt: skip
+    town = SimulatedTown(3, size=3)
+    scene = town.scene(0)
+    edge = town.streets.edges[0]
+    T, rng = np.eye(4), np.random.default_rng(0)
+    T[:2, 3] = edge.at(0.5 * edge.length_m)[0]
+    T[2, 3] = float(town.ground.height(T[None, :2, 3])[0]) + 1.73
+    drawn, _ = measured_sweep(LidarRaster(scene, model), T, 5.0, rng)
+    cast = LidarSensor(model, EmbreeCaster(scene)).sweep(T, 5.0, rng).cloud.xyz
+    exact = LidarSensor(replace(model, elevation_bias_rad=0.0), EmbreeCaster(scene))
+    true = exact.sweep(T, 5.0, rng).cloud.xyz
+    assert np.median(cKDTree(cast).query(drawn.numpy())[0]) < 0.005
+    heights = []
+    for xyz in (drawn.numpy(), cast, true):
+        range_m = np.linalg.norm(xyz, axis=1)
+        heights.append(np.median(xyz[(np.abs(range_m - 10.0) < 2.0) & (xyz[:, 2] < -1.0), 2]))
+    assert heights[:2] == pytest.approx([heights[2] - 0.065] * 2, abs=0.02)
 
 
 def test_the_same_seed_streams_the_same_sweeps() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from scipy.sparse import coo_matrix
@@ -24,7 +26,7 @@ def centres(mesh: Mesh, *labels: Label) -> np.ndarray:
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_streets_hang_together_and_have_dead_ends_and_curves(seed: int) -> None:
+def test_streets_hang_together_and_have_crossings_and_curves(seed: int) -> None:
     streets = street_map(seed)
     i, j = np.array([(edge.i, edge.j) for edge in streets.edges]).T
     links = coo_matrix((np.ones(len(i)), (i, j)), (len(streets.nodes),) * 2)
@@ -37,6 +39,16 @@ def test_streets_hang_together_and_have_dead_ends_and_curves(seed: int) -> None:
         np.testing.assert_allclose(ends, streets.nodes[[edge.i, edge.j]], atol=1e-9)
     bows = [e.length_m / np.linalg.norm(e.centreline[-1] - e.centreline[0]) for e in streets.edges]
     assert np.mean(np.array(bows) > 1.005) > 0.2
+
+
+def test_nearly_all_towns_have_dead_ends_and_none_is_made_of_them() -> None:
+    dead_ends = []
+    for seed in (*range(30), *range(100, 110), *range(200, 210)):
+        streets = street_map(seed)
+        degree = Counter(node for edge in streets.edges for node in (edge.i, edge.j))
+        dead_ends.append(sum(count == 1 for count in degree.values()))
+        assert dead_ends[-1] < len(streets.nodes) / 4
+    assert np.mean(np.array(dead_ends) > 0) >= 0.9
 
 
 def test_the_same_seed_is_the_same_town_and_another_is_not(town: SimulatedTown) -> None:
