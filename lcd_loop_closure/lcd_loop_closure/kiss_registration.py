@@ -1,5 +1,7 @@
 """Run KISS-ICP's parts one by one, so that a badly registered sweep need not enter its map."""
 
+import logging
+
 import numpy as np
 from kiss_icp.config import KISSConfig
 from kiss_icp.config.config import (
@@ -17,10 +19,14 @@ from kiss_icp.voxelization import voxel_down_sample
 from lcd_common import se3
 from lcd_common.se3 import Array
 
+_log = logging.getLogger(__name__)
+
 _ROUGH_ITERATIONS = 30
 _BRIEF_ITERATIONS = 12
 # Norm of the last step, metres and radians; KISS-ICP's own is 1e-4.
 _BRIEF_CONVERGENCE = 1e-2
+
+_asked_threads: list[int] = []  # each number once, in the order in which this process asked
 
 
 class KissRegistration:
@@ -34,8 +40,10 @@ class KissRegistration:
     ) -> None:
         """Start with an empty map; lengths in metres, 0 threads are all.
 
-        The number of threads belongs to the process: KISS-ICP keeps that of its first user.
+        The number of threads belongs to the process: KISS-ICP keeps that of its first user. Another
+        number is said once in the log.
         """
+        _note_threads(max_num_threads)
         # Everything is named, as KISSConfig otherwise reads the environment.
         self._config = KISSConfig(
             data=DataConfig(max_range=max_range, min_range=min_range, deskew=True),
@@ -109,3 +117,16 @@ class KissRegistration:
     def points(self) -> Array:
         """Return the points of the map [N x 3]."""
         return np.asarray(self._map.point_cloud())
+
+
+def _note_threads(asked: int) -> None:
+    if asked in _asked_threads:
+        return
+    _asked_threads.append(asked)
+    if asked != _asked_threads[0]:
+        _log.warning(
+            'threads = %d has no effect: KISS-ICP keeps the %d (0: all) of the first odometry in '
+            'the process; give all odometries the same number, or this one a process of its own',
+            asked,
+            _asked_threads[0],
+        )

@@ -34,7 +34,8 @@ class LoopConstraint:
         rmse_m: of partnered points, metres.
         inliers: partnered points.
         overlap: smaller share of the two directions, 0..1.
-        false_match_probability: 0..1.
+        false_match_probability: 0..1, as place recognition says of the query's best match; only of
+            candidates by descriptor.
         method: how the candidate was found and registered, e.g. scan_context+bev+gicp.
         status, reason: verdict, and one sentence for people with value and limit.
     """

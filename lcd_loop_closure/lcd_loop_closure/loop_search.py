@@ -1,6 +1,6 @@
 """Run the loop detector on a thread of its own, session after session."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from lcd_loop_closure.keyframes import Keyframe
 from lcd_loop_closure.loop import LoopConstraint
 from lcd_loop_closure.loop_detector import LoopDetector, LoopDetectorSettings
 from lcd_loop_closure.pair_registration import Timer
+from lcd_loop_closure.place_gate import PlaceVerdict
 from lcd_loop_closure.radius_search import GraphPositions
 from lcd_loop_closure.reduction import reduce_cloud
 
@@ -37,7 +38,8 @@ class SearchJob:
         sensor_origin: [3] position of the LiDAR in the base frame, metres.
         graph: the pose graph's positions; None before there are any.
         search: False only remembers the keyframe.
-        veto: why its candidates by descriptor are not tried; None when they are.
+        verdict: what place recognition says of its scan, which is for its candidates by descriptor;
+            None when it was not asked or did not answer.
     """
 
     session: Session
@@ -45,7 +47,7 @@ class SearchJob:
     sensor_origin: NDArray[np.float64]
     graph: GraphPositions | None
     search: bool = True
-    veto: str | None = None
+    verdict: PlaceVerdict | None = None
 
 
 class LoopSearch:
@@ -108,8 +110,16 @@ class LoopSearch:
         if not job.search:
             self._detector.remember(job.keyframe)
             return []
-        self._veto = job.veto
-        return self._detector.process(job.keyframe, _usable(job))
+        self._veto = None if job.verdict is None else job.verdict.rejected
+        loops = self._detector.process(job.keyframe, _usable(job))
+        return [_judged(loop, job.verdict) for loop in loops]
+
+
+def _judged(loop: LoopConstraint, verdict: PlaceVerdict | None) -> LoopConstraint:
+    """Say how likely the look of the place misleads, of a candidate that was found by it."""
+    if verdict is None or loop.descriptor_distance is None:
+        return loop
+    return replace(loop, false_match_probability=verdict.false_match_probability)
 
 
 def _usable(job: SearchJob) -> GraphPositions | None:

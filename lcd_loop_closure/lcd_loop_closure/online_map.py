@@ -100,6 +100,16 @@ class OnlineMap:
         return self._anchor is None
 
     @property
+    def waiting_loops(self) -> int:
+        """Number of loops whose keyframes have not come, or wait for their place themselves."""
+        return len(self._waiting) + len(self._unplaced_loops)
+
+    @property
+    def unplaced_keyframes(self) -> int:
+        """Number of keyframes of a new session that wait for its place in the loaded map."""
+        return len(self._unplaced)
+
+    @property
     def T_map_odom(self) -> se3.Array | None:
         """The correction of odometry; None while the session is not located."""
         return self.graph.T_map_odom if self.located else None

@@ -32,10 +32,17 @@ class PlaceGateConfig:
 
 @dataclass(frozen=True)
 class PlaceVerdict:
-    """What place recognition says of one scan: `rejected` is the reason, None when it does not."""
+    """What place recognition says of one scan.
+
+    Attributes:
+        stamp_ns: of the scan.
+        rejected: why the scan is not to be believed; None when it is not rejected.
+        false_match_probability: that its best match is wrong, 0..1, calibrated; None when unknown.
+    """
 
     stamp_ns: int
     rejected: str | None = None
+    false_match_probability: float | None = None
 
 
 class PlaceGate(Generic[Item]):

@@ -8,7 +8,7 @@ odometry link that many loops contradict.
 
 GTSAM's bindings hold Python's interpreter lock while they solve, for up to a second on ten thousand
 keyframes: run the solver in a process of its own where callbacks must not wait. Snapshots and
-verdicts are plain arrays and travel by pickle.
+verdicts are plain arrays and travel as npz files, without pickle (`verdict_process`).
 """
 
 import time

@@ -15,6 +15,7 @@ from odometry_drives import drive, follow, motion_error, step_ratios
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError, DataError
+from lcd_loop_closure import kiss_registration
 from lcd_loop_closure.lidar_odometry import LidarOdometry, OdometryConfig
 
 RNG = np.random.default_rng(7)
@@ -142,6 +143,17 @@ def test_one_thread_repeats_exactly() -> None:
         subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)
     )
     assert len(first.splitlines()) == 8 and first == second
+
+
+def test_another_number_of_threads_in_the_process_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(kiss_registration, '_asked_threads', [])
+    for threads in (1, 1, 2, 2, 1):
+        LidarOdometry(OdometryConfig(threads=threads))
+    (record,) = caplog.records
+    assert record.levelname == 'WARNING'
+    assert 'threads = 2 has no effect: KISS-ICP keeps the 1 (0: all)' in record.getMessage()
 
 
 def test_points_without_coordinates_change_nothing() -> None:

@@ -14,11 +14,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 import made_up_drive as drive
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from fed_loop_closure import Fed
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
-from bags.nodes.lockstep import LockStep
 from lcd_common import se3
 from lcd_common.errors import ConfigError
 from lcd_common.nodes import messages, qos
@@ -26,7 +26,7 @@ from lcd_loop_closure.nodes.conversions import keyframe_from_message
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.positions_message import positions_message
 from lcd_loop_closure.scan_context import ScanContext
-from lcd_msgs.msg import Keyframe, PlaceMatch, PlaceMatchArray
+from lcd_msgs.msg import Keyframe
 from lcd_msgs.srv import LoadMap
 
 pytestmark = pytest.mark.ros
@@ -37,29 +37,6 @@ Make = Callable[..., Any]
 def make(make: Make) -> Make:
     """Make nodes with more keyframes than by default: the made-up drive is short."""
     return partial(make, keyframes__distance=2.0)
-
-
-class Fed:
-    """A node in lock-step, and what it published."""
-
-    def __init__(self, node: LoopClosureNode, prefix: str = '/', transform: bool = True) -> None:
-        self.node, self.prefix = node, prefix
-        self.lockstep = LockStep([node])
-        self.keyframes: list[Any] = []
-        self.loops: list[Any] = []
-        self.lockstep.listen(prefix + 'keyframe', lambda m: self.keyframes.append(m))
-        self.lockstep.listen(prefix + 'loop_constraint', lambda m: self.loops.append(m))
-        if transform:
-            self.lockstep.feed('/tf_static', drive.static_transform())
-
-    def step(self, step: int, **options: Any) -> None:
-        """Feed the scan of a step, then its odometry."""
-        self.lockstep.feed(self.prefix + 'points', drive.scan(step))
-        self.lockstep.feed(self.prefix + 'odom', drive.odom_message(step, **options))
-
-    def counted(self, cause: str) -> int:
-        """Return a counter of the node."""
-        return self.node.diagnostics.counted(cause)
 
 
 def test_keyframes_follow_the_way_and_know_their_motion(make: Make) -> None:
@@ -223,6 +200,36 @@ def test_a_slow_search_drops_the_oldest_and_no_keyframe(
     assert remembered == [1, 2, 3, 4, 5]  # in their order, before the next search
 
 
+def test_scans_that_wait_to_become_keyframes_are_in_the_diagnostics(
+    make: Make, spin_until: Callable[..., bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make(LoopClosureNode, descriptor__method='scan_context')
+    free, begun = threading.Event(), threading.Event()
+
+    def slow(*given: Any) -> None:
+        begun.set()
+        free.wait(20.0)
+
+    monkeypatch.setattr(node._search, 'keyframe', slow)
+    heard: list[DiagnosticArray] = []
+    node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, qos.RELIABLE)
+
+    def wait(number: int) -> bool:
+        node.diagnostics.publish()
+        values = {v.key: v.value for m in heard[-1:] for v in m.status[0].values}
+        return values.get('scans waiting to become keyframes') == str(number)
+
+    node._transforms.on_tf_static(drive.static_transform())
+    for step in range(0, 24, 3):
+        node.on_points(drive.scan(step))
+        node.on_odom(drive.odom_message(step))
+        assert begun.wait(10.0)
+    assert spin_until([node], lambda: wait(5))  # as many as there is room for
+    assert node.diagnostics.counted('dropped keyframes: queue full') == 2
+    free.set()
+    assert spin_until([node], lambda: wait(0))
+
+
 def test_positions_of_the_graph_reach_the_search(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -300,48 +307,3 @@ def test_help_names_topics_and_services(node: str) -> None:
     )
     for word in ('Subscribes', 'Publishes', 'Services', 'keyframe', '~/load_map', 'ros2 run'):
         assert word in run.stdout
-
-
-def _place_matches(step: int, probability: float, accepted: bool) -> PlaceMatchArray:
-    match = PlaceMatch(place_id=7, false_match_probability=probability, accepted=accepted)
-    return PlaceMatchArray(header=messages.header(drive.stamp(step), 'lidar'), matches=[match])
-
-
-def test_the_gate_holds_a_keyframe_until_place_recognition_answered(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fed = Fed(
-        make(LoopClosureNode, threaded=False, gate__use=True, gate__wait=0.5, gate__window=0.1)
-    )
-    jobs: list[Any] = []
-
-    def note(job: Any) -> list[Any]:
-        jobs.append((job.keyframe.id, job.veto))
-        return []
-
-    monkeypatch.setattr(fed.node._search, 'run', note)
-    fed.step(0)
-    assert len(fed.keyframes) == 1 and jobs == []  # published at once, searched later
-    fed.lockstep.feed('/place_matches', _place_matches(0, 0.4, False))
-    assert jobs == [
-        (0, 'place recognition does not accept its best match, place 7: 40% likely to be wrong')
-    ]
-    fed.lockstep.feed('/place_matches', _place_matches(3, 0.01, True))  # sooner than the keyframe
-    fed.step(3)
-    fed.lockstep.feed('/place_matches', _place_matches(6, float('nan'), False))  # not calibrated
-    fed.step(6)
-    fed.lockstep.feed('/place_matches', PlaceMatchArray(header=drive.scan(9).header))  # no map yet
-    fed.step(9)
-    assert jobs[1:] == [(1, None), (2, None), (3, None)]
-    for step in range(12, 18):  # place recognition is gone: after half a second it goes on
-        fed.step(step)
-    assert [id for id, _ in jobs] == [0, 1, 2, 3]
-    fed.step(18)
-    assert jobs[4:] == [(4, None)]
-    assert fed.counted('keyframes rejected by place recognition') == 1
-    assert fed.counted('keyframes searched without an answer of place recognition') == 1
-
-
-def test_without_the_gate_place_recognition_is_not_heard(make: Make) -> None:
-    node = make(LoopClosureNode, threaded=False)
-    assert '/place_matches' not in {s.topic_name for s in node.subscriptions}

@@ -10,7 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from lcd_common import se3
 from lcd_common.nodes.messages import header, pose_message
-from lcd_loop_closure.nodes.path_message import path_bytes, quaternions
+from lcd_loop_closure.nodes.path_message import PathWriter, path_bytes, quaternions
 
 pytestmark = pytest.mark.ros
 
@@ -81,6 +81,21 @@ def test_bytes_are_those_of_rclpy(count: int, length: int) -> None:
         theirs[gap] = 0
     assert ours == theirs
     assert read == message
+
+
+def test_a_path_written_again_is_the_one_written_anew() -> None:
+    random = np.random.default_rng(3)
+    T, stamps = _poses(40)
+    T = T.copy()
+    writer = PathWriter('map')
+    for count in (0, 1, 5, 5, 6, 40, 12, 0, 13):
+        moved = random.integers(0, len(T), 3)
+        T = T.copy()
+        T[moved] = _poses(3, seed=count)[0]
+        if count == 12:  # another map, whose poses may be where the last one's were
+            stamps = stamps + 7
+        expected = path_bytes(T[:count], stamps[:count], count, 'map')
+        assert writer.write(T[:count], stamps[:count], count) == expected
 
 
 def test_ten_thousand_poses_survive() -> None:

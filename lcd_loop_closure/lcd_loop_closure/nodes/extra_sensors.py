@@ -53,6 +53,11 @@ class ExtraSensors:
         if use_imu:
             node.create_subscription(Imu, 'imu', self.on_imu, qos.SENSOR_FAST)
 
+    @property
+    def waiting_fixes(self) -> int:
+        """Number of satellite fixes whose odometry has not come."""
+        return len(self._fixes)
+
     def on_gps_fix(self, message: NavSatFix) -> None:
         """Let a fix wait for the odometry at its stamp."""
         try:

@@ -81,6 +81,7 @@ class GraphDisplay:
             on_error=self._on_error,
             name=f'{node.get_name()} display',
         )
+        diagnostics.watch('states waiting to be shown', self._worker.waiting)
 
     @property
     def map_wanted(self) -> bool:

@@ -76,6 +76,10 @@ class GraphJudge:
         while self._ready:
             self._on_verdict(*self._ready.pop(0))
 
+    def under_way(self) -> int:
+        """Return how many graphs are being judged, or have a verdict that is not handed over."""
+        return len(self._ready) + (not self._worker.idle())
+
     def stop(self) -> None:
         """End the worker and the solver's process."""
         self._stopping = True

@@ -158,6 +158,7 @@ class LoopClosureNode(Node):
         self.create_service(LoadMap, '~/load_map', self.on_load_map)
         self.create_service(Trigger, '~/reset', self.on_reset)
         self.diagnostics.watch('clouds waiting for odometry', lambda: len(self._buffer))
+        self.diagnostics.watch('scans waiting to become keyframes', self._scans.waiting)
         self.diagnostics.watch('keyframes waiting for the search', self._searches.waiting)
         self.diagnostics.watch('keyframes remembered', lambda: self._remembered)
         # The last one, as nobody would end the process of a node that was not made.
@@ -345,8 +346,7 @@ class LoopClosureNode(Node):
             self.diagnostics.count('keyframes searched without an answer of place recognition')
         elif verdict.rejected is not None:
             self.diagnostics.count('keyframes rejected by place recognition')
-            job = replace(job, veto=verdict.rejected)
-        self._searches.put(job)
+        self._searches.put(replace(job, verdict=verdict))
 
     def _skip(self, job: SearchJob) -> None:
         self.diagnostics.count('dropped searches: machine too slow')

@@ -2,7 +2,8 @@
 
 The whole path is published whenever a loop bends it. Building 10,000 PoseStamped objects in Python
 takes a quarter of a second; all poses share one frame_id, so their bytes have a fixed stride and
-one numpy array holds them. `publisher.publish` takes serialized bytes as it takes messages.
+one numpy array holds them. It is kept from one path to the next, as most poses stay where they are.
+`publisher.publish` takes serialized bytes as it takes messages.
 """
 
 import numpy as np
@@ -18,47 +19,80 @@ _POSE = 7 * 8  # position x y z, orientation x y z w
 def path_bytes(
     T_frame_body: se3.Array, stamps_ns: NDArray[np.int64], stamp_ns: int, frame_id: str
 ) -> bytes:
-    """Return a nav_msgs/Path in CDR.
+    """Return a nav_msgs/Path in CDR; arguments as of `PathWriter`."""
+    return PathWriter(frame_id).write(T_frame_body, stamps_ns, stamp_ns)
 
-    Args:
-        T_frame_body: poses [N x 4 x 4], metres.
-        stamps_ns: [N] stamps of the poses.
-        stamp_ns: stamp of the path.
-        frame_id: frame of the path and of every pose.
-    """
-    name = frame_id.encode() + b'\x00'
-    header = _time(np.array([stamp_ns])).tobytes() + _length(len(name)) + name
-    prefix = header + bytes(-len(header) % 4) + _length(len(T_frame_body))
-    if not len(T_frame_body):
-        return _ENCAPSULATION + prefix
 
-    pose_header = 12 + len(name)  # stamp, length of the name, name
-    padding = -pose_header % 8  # in front of the doubles, when the pose starts at a multiple of 8
-    record = np.dtype(
-        {
-            'names': ['time', 'length', 'name', 'position', 'orientation'],
-            'formats': [('<i4', 2), '<u4', f'V{len(name)}', ('<f8', 3), ('<f8', 4)],
-            'offsets': [0, 8, 12, pose_header + padding, pose_header + padding + 24],
-            'itemsize': pose_header + padding + _POSE,
-        }
-    )
-    # Every pose but the first starts behind a double, at a multiple of 8. The first starts behind
-    # the count; it is laid down as the others are, and its header then moved to where it belongs.
-    first_doubles = len(prefix) + pose_header
-    first_doubles += -first_doubles % 8
-    start = first_doubles - pose_header - padding
-    data = np.zeros(start + record.itemsize * len(T_frame_body), np.uint8)
-    poses = data[start:].view(record)
-    poses['time'] = _time(stamps_ns)
-    poses['length'] = len(name)
-    poses['name'] = np.frombuffer(name, f'V{len(name)}')[0]
-    poses['position'] = T_frame_body[:, :3, 3]
-    poses['orientation'] = quaternions(T_frame_body[:, :3, :3])
-    first_header = data[start : start + pose_header].copy()
-    data[start:first_doubles] = 0
-    data[: len(prefix)] = np.frombuffer(prefix, np.uint8)
-    data[len(prefix) : len(prefix) + pose_header] = first_header
-    return _ENCAPSULATION + data.tobytes()
+class PathWriter:
+    """Write one path after another, each time only the poses that changed."""
+
+    def __init__(self, frame_id: str) -> None:
+        """Start with no pose; `frame_id` is the frame of the path and of every pose."""
+        self._name = name = frame_id.encode() + b'\x00'
+        header = 12 + len(name)  # stamp, length of the name, name
+        padding = -header % 8  # in front of the doubles, when the pose starts at a multiple of 8
+        self._record = np.dtype(
+            {
+                'names': ['time', 'length', 'name', 'position', 'orientation'],
+                'formats': [('<i4', 2), '<u4', f'V{len(name)}', ('<f8', 3), ('<f8', 4)],
+                'offsets': [0, 8, 12, header + padding, header + padding + 24],
+                'itemsize': header + padding + _POSE,
+            }
+        )
+        # Every pose but the first starts behind a double, at a multiple of 8. The first starts
+        # behind the count; it is laid down as the others are, and all in front of its doubles is
+        # then written over with what belongs there.
+        prefix = header + -header % 4 + 4
+        self._doubles = prefix + header + -(prefix + header) % 8 + len(_ENCAPSULATION)
+        self._start = self._doubles - header - padding
+        self._T = np.empty((0, 4, 4))
+        self._stamps_ns = np.empty(0, np.int64)
+        self._reserve(0)
+
+    def write(self, T_frame_body: se3.Array, stamps_ns: NDArray[np.int64], stamp_ns: int) -> bytes:
+        """Return the path in CDR.
+
+        Args:
+            T_frame_body: poses [N x 4 x 4], metres; not to be written to until the next call.
+            stamps_ns: [N] stamps of the poses; neither.
+            stamp_ns: stamp of the path.
+        """
+        count = len(T_frame_body)
+        header = self._header(stamp_ns)
+        head = _ENCAPSULATION + header + bytes(-len(header) % 4) + _length(count)
+        if not count:
+            return head
+        if count > len(self._poses):
+            self._reserve(2 * count)
+        rows = self._changed(T_frame_body, stamps_ns)
+        self._T, self._stamps_ns = T_frame_body, stamps_ns
+        T = T_frame_body[rows]
+        self._poses['time'][rows] = _time(stamps_ns[rows])
+        self._poses['position'][rows] = T[:, :3, 3]
+        self._poses['orientation'][rows] = quaternions(T[:, :3, :3])
+        head = (head + self._header(int(stamps_ns[0]))).ljust(self._doubles, b'\x00')
+        self._data[: len(head)] = np.frombuffer(head, np.uint8)
+        return self._data[: self._start + self._record.itemsize * count].tobytes()
+
+    def _changed(self, T: se3.Array, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the rows that are not yet in the array as they are now."""
+        known = min(len(self._T), len(T))
+        changed = np.ones(len(T), bool)
+        if known:
+            changed[:known] = (T[:known] != self._T[:known]).reshape(known, 16).any(axis=1)
+            changed[:known] |= stamps_ns[:known] != self._stamps_ns[:known]
+        return np.nonzero(changed)[0]
+
+    def _reserve(self, count: int) -> None:
+        """Make room for so many poses, all of them to be written anew."""
+        self._data = np.zeros(self._start + self._record.itemsize * count, np.uint8)
+        self._poses = self._data[self._start :].view(self._record)
+        self._poses['length'] = len(self._name)
+        self._poses['name'] = np.frombuffer(self._name, f'V{len(self._name)}')[0]
+        self._T, self._stamps_ns = self._T[:0], self._stamps_ns[:0]
+
+    def _header(self, stamp_ns: int) -> bytes:
+        return _time(np.array([stamp_ns])).tobytes() + _length(len(self._name)) + self._name
 
 
 def quaternions(R: se3.Array) -> se3.Array:

@@ -18,10 +18,14 @@ def place_verdict(message: PlaceMatchArray) -> PlaceVerdict:
     if not message.matches:
         return PlaceVerdict(stamp_ns)
     best = message.matches[0]
-    if best.accepted or math.isnan(best.false_match_probability):
+    probability = best.false_match_probability
+    if math.isnan(probability):
         return PlaceVerdict(stamp_ns)
+    if best.accepted:
+        return PlaceVerdict(stamp_ns, None, probability)
     return PlaceVerdict(
         stamp_ns,
         f'place recognition does not accept its best match, place {best.place_id}: '
-        f'{best.false_match_probability:.0%} likely to be wrong',
+        f'{probability:.0%} likely to be wrong',
+        probability,
     )

@@ -48,10 +48,11 @@ from lcd_loop_closure.nodes.conversions import keyframe_from_message, loop_from_
 from lcd_loop_closure.nodes.extra_sensors import ExtraSensors
 from lcd_loop_closure.nodes.graph_display import GraphDisplay, Shown
 from lcd_loop_closure.nodes.graph_judge import GraphJudge
+from lcd_loop_closure.nodes.graph_watch import watch_graph
 from lcd_loop_closure.nodes.group_parameters import declare_groups
 from lcd_loop_closure.nodes.map_services import MapServices
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
-from lcd_loop_closure.nodes.path_message import path_bytes
+from lcd_loop_closure.nodes.path_message import PathWriter
 from lcd_loop_closure.nodes.pose_output import PoseOutput
 from lcd_loop_closure.nodes.positions_message import positions_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
@@ -63,6 +64,7 @@ from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import LoopConstraint as LoopConstraintMessage
 
 _RECENT = 100  # odometry messages that an initial pose may refer to
+_STILL = 2  # refreshes without a keyframe: the vehicle stands, or the drive is over
 
 
 @config
@@ -156,8 +158,9 @@ class PoseGraphNode(Node):
         self._recent: OrderedDict[int, se3.Array] = OrderedDict()  # T_odom_base by stamp
         self._shown_s = self._mapped_s = self._judged_s = -math.inf
         self._refreshed_at: Keyframe | None = None
+        self._still = 0  # refreshes without a keyframe
         self._undrawn = self._unmapped = False
-
+        self._path = PathWriter(self.config.map_frame)
         self._path_out = self.create_publisher(Path, 'path', qos.LATCHED)
         self._positions_out = self.create_publisher(PointCloud2, 'graph/keyframes', qos.LATCHED)
         self.create_subscription(KeyframeMessage, 'keyframe', self.on_keyframe, qos.RELIABLE)
@@ -173,8 +176,7 @@ class PoseGraphNode(Node):
         # fires what runs by its own clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self.refresh, clock=steady if threaded else None)
-        self.diagnostics.watch('keyframes in the map', lambda: len(self.map))
-        self.diagnostics.watch('map memory [MB]', lambda: f'{self.map.nbytes * 1e-6:.1f}')
+        watch_graph(self.diagnostics, self.map, self._judge, self._sensors)
         self._map_path = ''
         if self.config.map:
             self.restart(self.config.map)
@@ -288,16 +290,17 @@ class PoseGraphNode(Node):
         self._pose.changed()
         self._undrawn = self._unmapped = True
         with self.diagnostics.stage('path'):
-            poses, ids, frame = graph.poses(), graph.ids, self.config.map_frame
-            self._path_out.publish(path_bytes(poses, graph.stamps_ns, stamp_ns, frame))
-            self._positions_out.publish(positions_message(ids, poses, stamp_ns, frame))
+            poses, frame = graph.poses(), self.config.map_frame
+            self._path_out.publish(self._path.write(poses, graph.stamps_ns, stamp_ns))
+            self._positions_out.publish(positions_message(graph.ids, poses, stamp_ns, frame))
 
     def refresh(self) -> None:
         """Show what was held back, and say whether map -> odom has another owner."""
         self._judge.hand_over()
-        # Nothing new since the last time: what waits for its verdict need not wait longer.
-        quiet, self._refreshed_at = self.map.last is self._refreshed_at, self.map.last
-        self._have_judged(now=quiet)
+        # Nothing new for a while: what waits for its verdict need not wait longer.
+        self._still = self._still + 1 if self.map.last is self._refreshed_at else 0
+        self._refreshed_at = self.map.last
+        self._have_judged(now=self._still >= _STILL)
         self._show(all_of_it=not self.config.threaded)
         self._pose.check_authority()
 
@@ -369,11 +372,8 @@ class PoseGraphNode(Node):
     def _show(self, *, all_of_it: bool = False) -> None:
         """Publish what people look at, as often as it is due, or all that was held back."""
         now_s = self._now_s()
-        map_due = (
-            self._unmapped
-            and now_s - self._mapped_s >= self.config.map_period
-            and self._display.map_wanted
-        )
+        map_due = self._unmapped and now_s - self._mapped_s >= self.config.map_period
+        map_due = map_due and self._display.map_wanted
         due = all_of_it or now_s - self._shown_s >= self.config.display_period
         if map_due or (self._undrawn and due):
             self.show(map_cloud=map_due)
