@@ -66,7 +66,7 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         ),
         'peers': ('the same folders through KISS-SLAM', drives.side_by_side),
         'memory': (
-            'an hour of replay',
+            'an hour of replay, and a quarter without keyframes',
             partial(memory.evaluate, recorded_s=900.0) if quick else memory.evaluate,
         ),
     }

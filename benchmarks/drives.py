@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from bags.drives import open_drive
+from bags.records import Drive
 from bags.street import StreetConfig, StreetDrive
 from benchmarks import peers
-from benchmarks.judging import found_share, kiss_slam_figures, suite_figures
+from benchmarks.judging import found_share, kiss_slam_figures, link_figures, suite_figures
 from benchmarks.kitti_folder import write_kitti_folder
 from benchmarks.recordings import karlsruhe_out_and_back
 from lcd_common import se3
@@ -24,10 +25,11 @@ from lcd_loop_closure.report.evaluation import trajectory_errors
 from lcd_loop_closure.report.loop_evaluation import Verdict, judge_loops
 from lcd_loop_closure.report.result import DriveResult, corrected_trajectory
 
-# Stated in the results: the Karlsruhe sweeps reach 80 m and show the car itself below 3 m.
-_RANGES: dict[str, dict[str, float]] = {
+# The Karlsruhe sweeps reach 80 m and show the car itself below 3 m.
+RANGES: dict[str, dict[str, float]] = {
     'out_and_back': {'max_range': 80.0, 'min_range': 3.0},
     'street': {'max_range': 100.0, 'min_range': 1.0},
+    'town': {'max_range': 100.0, 'min_range': 1.5},
 }
 
 
@@ -40,7 +42,7 @@ def out_and_back_live(work: Path) -> dict[str, Any]:
     if not bag.is_dir():
         bags = str(Path(sys.executable).parent / 'bags')
         subprocess.run([bags, 'convert', str(sequence), '--out', str(bag)], check=True)
-    ranges = [f'{name}:={value}' for name, value in _RANGES['out_and_back'].items()]
+    ranges = [f'{name}:={value}' for name, value in RANGES['out_and_back'].items()]
     live = run_live(bag, {'lidar_odometry': ranges}, work / 'live_log')
     recorder = live.recorder
     truth = open_drive(sequence).truth()
@@ -100,15 +102,30 @@ def _lockstep_figures(sequence: Path, work: Path, threads: int) -> dict[str, Any
 
 
 def u_turn(work: Path, towns: int = 3) -> dict[str, Any]:
-    """Break the odometry by an abrupt U-turn, for the suite and for KISS-SLAM, on several towns."""
+    """Break the odometry by an abrupt U-turn, for the suite and for KISS-SLAM, on several towns.
+
+    The suite's own odometry does not break there. `broken` is what loop closure and pose graph make
+    of plain KISS-ICP's, which does and says nothing of it.
+    """
     runs = {}
     for seed in range(towns):
         drive = StreetDrive('abrupt_u_turn', settings=StreetConfig(seed=seed))
-        sequence = _street_folder(drive, work / f'u_turn_{seed}')
-        runs[f'town_{seed}'] = _side_by_side(sequence, work, 'street')
+        sequence = kitti_folder(drive, work / f'u_turn_{seed}')
+        peer = _peer(sequence, work, 'street')
+        runs[f'town_{seed}'] = {
+            **_compared(sequence, work, 'street', peer),
+            'broken': _on_odometry_of(peer, sequence),
+        }
+    broken = [run['broken'] for run in runs.values()]
     return {
         'ate_m': float(np.mean([run['suite']['ate_m'] for run in runs.values()])),
         'kiss_slam_ate_m': float(np.mean([run['kiss_slam']['ate_m'] for run in runs.values()])),
+        'broken': {
+            key: float(np.mean([b[key] for b in broken]))
+            if key.endswith('_m')
+            else sum(b[key] for b in broken)
+            for key in broken[0]
+        },
         **runs,
     }
 
@@ -117,19 +134,36 @@ def side_by_side(work: Path) -> dict[str, Any]:
     """Run suite and KISS-SLAM on the same folders: real out-and-back sweeps and the street loop."""
     folders = {
         'out_and_back': (karlsruhe_out_and_back(work), 'out_and_back'),
-        'street_loop': (_street_folder(StreetDrive('loop'), work / 'street_loop'), 'street'),
+        'street_loop': (kitti_folder(StreetDrive('loop'), work / 'street_loop'), 'street'),
     }
-    runs = {name: _side_by_side(at, work, kind) for name, (at, kind) in folders.items()}
+    runs = {name: suite_and_peer(at, work, kind) for name, (at, kind) in folders.items()}
     return {
         'kiss_slam': {name: run['kiss_slam'] for name, run in runs.items()},
         'suite': {name: run['suite'] for name, run in runs.items()},
     }
 
 
-def _side_by_side(sequence: Path, work: Path, kind: str) -> dict[str, Any]:
+def suite_and_peer(sequence: Path, work: Path, kind: str) -> dict[str, Any]:
+    """Return the figures of the suite and of KISS-SLAM on a folder of `kitti_folder`.
+
+    Args:
+        sequence: the folder.
+        work: for intermediate files.
+        kind: 'out_and_back', 'street' or 'town': the ranges that both use.
+
+    Raises:
+        PeerError: KISS-SLAM could not be installed or failed.
+    """
+    return _compared(sequence, work, kind, _peer(sequence, work, kind))
+
+
+def _peer(sequence: Path, work: Path, kind: str) -> peers.KissSlamRun:
+    ranges = RANGES[kind]
+    return peers.kiss_slam(sequence, work, ranges['max_range'], ranges['min_range'])
+
+
+def _compared(sequence: Path, work: Path, kind: str, peer: peers.KissSlamRun) -> dict[str, Any]:
     result = _drive_through(sequence, work, kind, threads=0)
-    ranges = _RANGES[kind]
-    peer = peers.kiss_slam(sequence, work, ranges['max_range'], ranges['min_range'])
     stamps = result.scan_stamps_ns
     poses = read_poses(sequence.parent.parent / 'poses' / '00.txt')
     return {
@@ -138,18 +172,35 @@ def _side_by_side(sequence: Path, work: Path, kind: str) -> dict[str, Any]:
     }
 
 
+def _on_odometry_of(peer: peers.KissSlamRun, sequence: Path) -> dict[str, Any]:
+    """Return the figures of the suite on the peer's odometry."""
+    from benchmarks.nodes.given_odometry import drive_on
+
+    drive = open_drive(sequence)
+    truth = drive.truth()
+    assert truth is not None
+    T_base_lidar = next(m.T_parent_child for m in drive.mountings if m.child == 'lidar')
+    T_odom_base = T_base_lidar @ peer.T_odom_lidar @ se3.inverse(T_base_lidar)
+    poses = dict(zip(truth.stamps_ns.tolist(), T_odom_base, strict=True))
+    result, given_up = drive_on(poses, drive, source='odometry of KISS-ICP')
+    figures = suite_figures(result, evaluate_drive(result))
+    del figures['ms_per_scan']  # without odometry it says nothing
+    return {**figures, **link_figures(result, given_up)}
+
+
 def _drive_through(sequence: Path, work: Path, kind: str, threads: int) -> DriveResult:
     from lcd_loop_closure.nodes.offline_slam import drive_through
 
     parameters = work / f'{kind}.yaml'
-    lines = ''.join(f'    {name}: {value}\n' for name, value in _RANGES[kind].items())
+    lines = ''.join(f'    {name}: {value}\n' for name, value in RANGES[kind].items())
     parameters.write_text(f'/lidar_odometry:\n  ros__parameters:\n{lines}')
     return drive_through(
         open_drive(sequence), threads=threads, parameter_files=[parameters], source=kind
     )
 
 
-def _street_folder(drive: StreetDrive, root: Path) -> Path:
+def kitti_folder(drive: Drive, root: Path) -> Path:
+    """Return a drive's sequence folder in KITTI's layout, written unless it is there."""
     sequence = root / 'sequences' / '00'
     return sequence if (sequence / 'calib.txt').is_file() else write_kitti_folder(drive, root)
 

@@ -1,5 +1,7 @@
 """Judge the suite and its peer by the same code: errors by evo, loops by the reference."""
 
+from collections.abc import Collection
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,43 @@ def kiss_slam_figures(run: KissSlamRun, truth_lidar: Trajectory) -> dict[str, An
         'loops_wrong': len(run.closures) - right,
         'ms_per_scan': float(1e3 * run.seconds.mean()),
     }
+
+
+def link_figures(result: DriveResult, given_up: Collection[int]) -> dict[str, int]:
+    """Return how many links between keyframes odometry broke, and what the pose graph noticed.
+
+    A link is broken when it is off by more than a loop may be, by the reference. It is noticed when
+    the graph gave it up or one next to it: where a keyframe between the two has no loop, nothing
+    tells them apart.
+
+    Args:
+        result: of a drive with a reference, on a new map.
+        given_up: ids of the keyframes whose link to their predecessor the graph gave up.
+    """
+    limits, truth = LoopJudgementConfig(), result.truth
+    assert truth is not None
+    broken = set()
+    stamps = result.keyframes.stamps_ns.tolist()
+    for row, (last_ns, this_ns) in enumerate(pairwise(stamps), start=1):
+        T_odometry, T_true = (
+            _motion(trajectory, last_ns, this_ns) for trajectory in (result.odometry, truth)
+        )
+        metres, radians = se3.distance(T_true, T_odometry)
+        if metres > limits.max_translation_error or np.degrees(radians) > limits.max_rotation_error:
+            broken.add(row)
+    suspected = set(given_up)
+    return {
+        'links_broken': len(broken),
+        'links_noticed': sum(not suspected.isdisjoint({k - 1, k, k + 1}) for k in broken),
+        'links_noticed_exactly': len(broken & suspected),
+        'links_wrongly_given_up': sum(broken.isdisjoint({k - 1, k, k + 1}) for k in suspected),
+    }
+
+
+def _motion(trajectory: Trajectory, first_ns: int, last_ns: int) -> se3.Array:
+    T_first, T_last = trajectory.at(first_ns), trajectory.at(last_ns)
+    assert T_first is not None and T_last is not None
+    return se3.inverse(T_first) @ T_last
 
 
 def found_share(loops: LoopEvaluation, not_before_ns: int) -> float:

@@ -10,7 +10,7 @@ from lcd_common import se3
 from lcd_loop_closure.lidar_odometry import LidarOdometry, OdometryConfig
 
 _SWEEPS = 250
-_OVER_M = 4.0  # about two keyframes
+_OVER_M = 4.0  # a little more than from one keyframe to the next
 
 
 def evaluate(work: Path) -> dict[str, Any]:

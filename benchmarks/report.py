@@ -12,15 +12,20 @@ from typing import Any
 
 from benchmarks.recordings import RESULTS, ROOT
 
+# What benchmarks write: it changes no figure.
+_WRITTEN = ('benchmarks/results', 'docs/images')
+
+
+def commit(root: Path = ROOT) -> str:
+    """Return the commit of a working tree; it ends in -dirty when what is measured is not of it."""
+    name = _git(root, 'describe', '--always', '--abbrev=12')
+    excluded = [f':(top,exclude){folder}' for folder in _WRITTEN]
+    changed = _git(root, 'status', '--porcelain', '--', ':(top)', *excluded)
+    return f'{name or "unknown"}{"-dirty" if changed else ""}'
+
 
 def provenance() -> dict[str, str | int]:
     """Return commit, machine and date of a measurement."""
-    commit = subprocess.run(
-        ['git', 'describe', '--always', '--dirty', '--abbrev=12'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    ).stdout.strip()
     model = next(
         (
             line.split(':')[1].strip()
@@ -30,7 +35,7 @@ def provenance() -> dict[str, str | int]:
         platform.processor(),
     )
     return {
-        'commit': commit or 'unknown',
+        'commit': commit(),
         'date': datetime.date.today().isoformat(),
         'machine': f'{model}, {os.cpu_count()} cores',
         'python': platform.python_version(),
@@ -85,6 +90,11 @@ def print_table(figures: Mapping[str, Any]) -> None:
     for key, value in rows:
         shown = f'{value:.6g}' if isinstance(value, float) else str(value)
         sys.stdout.write(f'{key:<{width}}  {shown}\n')
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(['git', *arguments], cwd=root, capture_output=True, text=True)
+    return done.stdout.strip()
 
 
 def _rounded(value: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Write the README's result tables from benchmarks/results/*.json: no number is copied by hand.
+"""Write the READMEs' result tables from benchmarks/results/*.json: no number is copied by hand.
 
-A table stands in README.md between `<!-- table:NAME -->` and `<!-- end -->`; NAME.json has its
-figures.
+A table stands in README.md or benchmarks/README.md between `<!-- table:NAME -->` and
+`<!-- end -->`.
 """
 
 import argparse
@@ -9,38 +9,21 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.result_table import Row, Table
+from benchmarks.town_tables import TOWN_TABLES
 from lcd_common.command_line import run
 from lcd_common.errors import DataError
 
 ROOT = Path(__file__).resolve().parents[1]
+READMES = (ROOT / 'README.md', ROOT / 'benchmarks' / 'README.md')
 _BLOCK = re.compile(r'(<!-- table:([\w-]+) -->\n)(.*?)(<!-- end -->)', re.DOTALL)
 
-
-@dataclass(frozen=True)
-class Row:
-    """One row: what was measured, how it is written, and what was asked for.
-
-    Attributes:
-        what: for people.
-        shown: a format string for the values, e.g. '{:.0f} / {:.0f} ms'.
-        keys: dotted keys of the values in the result file.
-        asked: the limit, or empty.
-        times: factor of the values, e.g. 100 for a share shown in percent.
-    """
-
-    what: str
-    shown: str
-    keys: tuple[str, ...]
-    asked: str = ''
-    times: float = 1.0
-
-
-TABLES: dict[str, tuple[Row, ...]] = {
-    'drive': (
+TABLES: dict[str, Table] = {
+    **TOWN_TABLES,
+    'drive': Table('drive', (
         Row('Real out-and-back drive, live at 1x: scans that odometry lost', '{:.0f}',
             ('out_and_back.odometry_lost',), '0'),
         Row('— odometry latency, median / 99 %', '{:.0f} / {:.0f} ms',
@@ -69,23 +52,8 @@ TABLES: dict[str, tuple[Row, ...]] = {
         Row('One graph update at 10,000 keyframes, 99 %', '{:.1f} ms',
             ('graph_update_p99_ms_at_10000',), '≤ 50 ms'),
         Row('Memory of a keyframe', '{:.1f} kB', ('memory.bytes_per_keyframe',), '', 1e-3),
-    ),
-    'town': (
-        Row('HDL-64E sweeps a second, two cores', '{:.1f}', ('sweeps_per_second_cpu',), '≥ 12'),
-        Row('— on a GPU, by the torch renderer', '{:.0f}', ('sweeps_per_second_gpu',), '≥ 300'),
-        Row('Camera frames of 1241 x 376 a second, two cores', '{:.1f}',
-            ('camera_frames_per_second_cpu',), '≥ 8'),
-        Row('Rays on which both renderers agree within 1 cm', '{:.3f} %',
-            ('renderers_within_1cm_share',), '≥ 99.9 %', 100),
-        Row('Drift of KISS-ICP', '{:.2f} %', ('kiss_icp_drift_percent',), '0.3-0.8 %'),
-        Row('Average precision of Scan Context, same way', '{:.2f}',
-            ('scan_context_ap.same_way',), '0.90-0.98'),
-        Row('— in reverse', '{:.2f}', ('scan_context_ap.reverse',), '0.50-0.80'),
-        Row('Live at 10 Hz: scans that odometry lost', '{:.0f}', ('live_10hz.odometry_lost',), '0'),
-        Row('— odometry latency, 99 %', '{:.0f} ms',
-            ('live_10hz.odometry_latency_p99_ms',), '≤ 150 ms'),
-    ),
-    'lcdnet': (
+    )),
+    'lcdnet': Table('lcdnet', (
         Row('Average precision, protocol 1, same way / reverse: LCDNet', '{:.3f} / {:.3f}',
             ('ap.protocol1.same_way.lcdnet', 'ap.protocol1.reverse.lcdnet'), '≥ 0.97 / 0.95'),
         *(
@@ -119,7 +87,7 @@ TABLES: dict[str, tuple[Row, ...]] = {
         Row('Query among 18,235 / 1,000,000', '{:.2f} / {:.1f} ms',
             ('query_ms.18235', 'query_ms.1000000'), '≤ 1 / 20 ms'),
         Row('Memory of a keyframe', '{:.0f} kB', ('keyframe_bytes',), '≤ 500 kB', 1e-3),
-    ),
+    )),
 }  # fmt: skip
 
 
@@ -135,18 +103,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         '--check', action='store_true', help='change nothing; fail when out of date'
     )
-    parser.add_argument('--readme', type=Path, default=ROOT / 'README.md')
+    parser.add_argument('--readme', type=Path, nargs='+', default=READMES, metavar='FILE')
     parser.add_argument('--results', type=Path, default=ROOT / 'benchmarks' / 'results')
     arguments = parser.parse_args(argv)
     return run(lambda: _update(arguments.readme, arguments.results, arguments.check))
-
-
-def table(rows: Sequence[Row], figures: Mapping[str, Any]) -> str:
-    """Return a markdown table; what the figures lack is written as not measured."""
-    lines = ['| what | measured | asked |', '|---|---|---|']
-    lines += [f'| {row.what} | {_shown(row, figures)} | {row.asked} |' for row in rows]
-    origin = _origin(figures)
-    return '\n'.join(lines) + '\n' + (f'\n{origin}\n' if origin else '')
 
 
 def rewritten(text: str, results: Path) -> str:
@@ -160,9 +120,8 @@ def rewritten(text: str, results: Path) -> str:
         name = match.group(2)
         if name not in TABLES:
             raise DataError(f'table {name!r} is unknown; it must be one of {", ".join(TABLES)}')
-        return (
-            match.group(1) + table(TABLES[name], _read(results / f'{name}.json')) + match.group(4)
-        )
+        figures = _read(results / f'{TABLES[name].results}.json')
+        return match.group(1) + TABLES[name].markdown(figures) + match.group(4)
 
     new, count = _BLOCK.subn(block, text)
     if not count:
@@ -170,18 +129,22 @@ def rewritten(text: str, results: Path) -> str:
     return new
 
 
-def _update(readme: Path, results: Path, check: bool) -> int:
-    old = readme.read_text()
-    new = rewritten(old, results)
-    if new == old:
-        sys.stdout.write(f'{readme.name}: the tables are up to date\n')
-        return 0
-    if check:
-        sys.stdout.write(f'{readme.name}: the tables differ; run python -m benchmarks.tables\n')
-        return 1
-    readme.write_text(new)
-    sys.stdout.write(f'{readme.name}: tables rewritten\n')
-    return 0
+def _update(readmes: Sequence[Path], results: Path, check: bool) -> int:
+    """Rewrite the files, or only say which differ; return 1 when one was to be checked and does."""
+    different = 0
+    for readme in readmes:
+        shown = readme.relative_to(ROOT) if readme.is_relative_to(ROOT) else readme
+        old = readme.read_text()
+        new = rewritten(old, results)
+        if new == old:
+            sys.stdout.write(f'{shown}: the tables are up to date\n')
+        elif check:
+            different = 1
+            sys.stdout.write(f'{shown}: the tables differ; run python -m benchmarks.tables\n')
+        else:
+            readme.write_text(new)
+            sys.stdout.write(f'{shown}: tables rewritten\n')
+    return different
 
 
 def _read(path: Path) -> Mapping[str, Any]:
@@ -194,27 +157,6 @@ def _read(path: Path) -> Mapping[str, Any]:
             f'{path}: expected nested keys, got {type(figures).__name__}; measure again'
         )
     return figures
-
-
-def _value(figures: Mapping[str, Any], key: str) -> float | None:
-    value: Any = figures
-    for part in key.split('.'):
-        value = value.get(part) if isinstance(value, Mapping) else None
-    return float(value) if isinstance(value, int | float) and value == value else None
-
-
-def _shown(row: Row, figures: Mapping[str, Any]) -> str:
-    values = [_value(figures, key) for key in row.keys]
-    known = [value * row.times for value in values if value is not None]
-    return row.shown.format(*known) if len(known) == len(values) else 'not measured'
-
-
-def _origin(figures: Mapping[str, Any]) -> str:
-    """Say at which commit, when and on what the figures were measured."""
-    for group in (figures, *figures.values()):
-        if isinstance(group, Mapping) and {'commit', 'date', 'machine'} <= set(group):
-            return f'Measured at commit `{group["commit"]}` on {group["date"]}: {group["machine"]}.'
-    return ''
 
 
 if __name__ == '__main__':

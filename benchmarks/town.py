@@ -46,6 +46,11 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
             'drift of KISS-ICP on simulated drives',
             partial(simulated_drives.kiss_icp, towns=1) if quick else simulated_drives.kiss_icp,
         ),
+        'kiss_slam': (
+            'a simulated drive: the suite beside KISS-SLAM',
+            partial(simulated_drives.kiss_slam, length_m=300.0) if quick
+            else simulated_drives.kiss_slam,
+        ),
         'live_10hz': (
             'a simulated drive at 1x through DDS',
             partial(simulated_drives.live, seconds=120.0) if quick else simulated_drives.live,
