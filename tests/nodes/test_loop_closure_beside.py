@@ -228,8 +228,13 @@ def test_a_killed_process_ends_the_replay_with_a_word(make: Make) -> None:
     assert child is not None
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
+
+    def drive_on() -> None:
+        for step in (3, 6):  # the first takes the answer, if it came before the end
+            fed.step(step)
+
     with pytest.raises(SearchProcessError, match='drive again'):
-        fed.step(3)
+        drive_on()
 
 
 def test_the_process_ends_with_the_node(ros: None) -> None:

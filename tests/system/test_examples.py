@@ -50,6 +50,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
 
 def test_the_composed_nodes_come_up_and_end_with_ctrl_c(ros: None) -> None:
     import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
 
     node = rclpy.create_node('watcher')
     environment = {**os.environ, 'PYTHONUNBUFFERED': '1'}
@@ -70,6 +71,12 @@ def test_the_composed_nodes_come_up_and_end_with_ctrl_c(ros: None) -> None:
         while node.count_subscribers('/velodyne') < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
         assert node.count_subscribers('/velodyne') == 2
+        # Diagnostics come from timers: all nodes are made, and the executor spins.
+        heard: list[DiagnosticArray] = []
+        node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+        while not heard and time.monotonic() < deadline:
+            rclpy.spin_once(node, timeout_sec=0.1)
+        assert heard
     finally:
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=30)
