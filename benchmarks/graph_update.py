@@ -53,7 +53,7 @@ def _timed(node: 'PoseGraphNode', keyframes: int, measured: int, seed: int) -> d
     for keyframe in town.keyframes():
         new = loops.get(keyframe.id, [])
         wall, cpu = time.perf_counter(), time.thread_time()
-        take(node, keyframe, new)
+        _take(node, keyframe, new)
         graph_done = time.perf_counter()
         node.publish_graph()
         path_ms.append((time.perf_counter() - graph_done) * 1e3)
@@ -89,13 +89,12 @@ def _timed(node: 'PoseGraphNode', keyframes: int, measured: int, seed: int) -> d
     }
 
 
-def take(node: 'PoseGraphNode', keyframe: Keyframe, loops: list[LoopConstraint]) -> None:
+def _take(node: 'PoseGraphNode', keyframe: Keyframe, loops: list[LoopConstraint]) -> None:
     """Bring the node's graph up to date with a keyframe and its loops."""
     node.map.add_keyframe(keyframe)
     for loop in loops:
         node.map.add_loop(loop)
     node.map.graph.update()
-    node.map.graph.poses()
 
 
 def _percentile(values: Any, share: float) -> float:

@@ -59,7 +59,8 @@ def add_parser(commands: Any) -> None:
         help='largest shift to the side when a street is driven again (default: 1)')  # fmt: skip
     add('--speed', type=float, metavar='M/S', help='top speed (default: 11)')
     add('--sensor', default='hdl64', metavar='NAME',
-        help='hdl64, os1_64, os1_64_mulran, vlp16 or beams32 (default: %(default)s)')  # fmt: skip
+        help='hdl64, hdl64_kitti (calibrated as badly as KITTI\'s), os1_64, os1_64_mulran, vlp16 '
+        'or beams32 (default: %(default)s)')  # fmt: skip
     add('--blocked', type=float, nargs=2, action='append', default=[], metavar=('BEGIN', 'END'),
         help='a sector that the LiDAR does not see: from one azimuth to the other, degrees '
         'counter-clockwise from straight ahead; -45 45 is the 90 degrees ahead. Several are '

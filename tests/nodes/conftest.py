@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,3 +33,9 @@ def make(ros: None) -> Iterator[Callable[..., Any]]:
     yield construct
     for node in nodes:
         node.destroy_node()
+
+
+@pytest.fixture
+def make_often(make: Callable[..., Any]) -> Callable[..., Any]:
+    """Make nodes with more keyframes than by default: the made-up drive is short."""
+    return partial(make, keyframes__distance=2.0)

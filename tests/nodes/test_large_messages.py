@@ -45,7 +45,8 @@ def _run(code: str, folder: Path, **variables: str) -> str:
 
 
 _NEEDS_MEMORY = pytest.mark.skipif(
-    not Path('/dev/shm').is_dir() or shutil.disk_usage('/dev/shm').free < 256 << 20,
+    not Path('/dev/shm').is_dir()
+    or shutil.disk_usage('/dev/shm').free < large_messages._ENOUGH_BYTES,
     reason='needs 256 MB of shared memory',
 )
 

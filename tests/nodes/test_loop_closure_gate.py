@@ -1,7 +1,6 @@
 """Let place recognition decide which candidates loop_closure registers."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,22 +18,18 @@ pytestmark = pytest.mark.ros
 Make = Callable[..., Any]
 
 
-@pytest.fixture
-def make(make: Make) -> Make:
-    """Make nodes with more keyframes than by default: the made-up drive is short."""
-    return partial(make, keyframes__distance=2.0)
-
-
 def _place_matches(step: int, probability: float, accepted: bool) -> PlaceMatchArray:
     match = PlaceMatch(place_id=7, false_match_probability=probability, accepted=accepted)
     return PlaceMatchArray(header=messages.header(drive.stamp(step), 'lidar'), matches=[match])
 
 
 def test_the_gate_holds_a_keyframe_until_place_recognition_answered(
-    make: Make, monkeypatch: pytest.MonkeyPatch
+    make_often: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fed = Fed(
-        make(LoopClosureNode, threaded=False, gate__use=True, gate__wait=0.5, gate__window=0.1)
+        make_often(
+            LoopClosureNode, threaded=False, gate__use=True, gate__wait=0.5, gate__window=0.1
+        )
     )
     jobs: list[Any] = []
 
@@ -66,8 +61,10 @@ def test_the_gate_holds_a_keyframe_until_place_recognition_answered(
 
 
 @pytest.mark.parametrize('by', ['descriptor', 'radius'])
-def test_candidates_by_descriptor_tell_the_probability_of_the_gate(make: Make, by: str) -> None:
-    node = make(
+def test_candidates_by_descriptor_tell_the_probability_of_the_gate(
+    make_often: Make, by: str
+) -> None:
+    node = make_often(
         LoopClosureNode,
         threaded=False,
         gate__use=True,
@@ -98,6 +95,6 @@ def test_candidates_by_descriptor_tell_the_probability_of_the_gate(make: Make, b
         assert fed.loops and all(np.isnan(m.false_match_probability) for m in fed.loops)
 
 
-def test_without_the_gate_place_recognition_is_not_heard(make: Make) -> None:
-    node = make(LoopClosureNode, threaded=False)
+def test_without_the_gate_place_recognition_is_not_heard(make_often: Make) -> None:
+    node = make_often(LoopClosureNode, threaded=False)
     assert '/place_matches' not in {s.topic_name for s in node.subscriptions}

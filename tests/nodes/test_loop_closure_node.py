@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,14 +32,8 @@ pytestmark = pytest.mark.ros
 Make = Callable[..., Any]
 
 
-@pytest.fixture
-def make(make: Make) -> Make:
-    """Make nodes with more keyframes than by default: the made-up drive is short."""
-    return partial(make, keyframes__distance=2.0)
-
-
-def test_keyframes_follow_the_way_and_know_their_motion(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_keyframes_follow_the_way_and_know_their_motion(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     for step in range(13):
         fed.step(step)
     made = [keyframe_from_message(m) for m in fed.keyframes]
@@ -59,8 +52,8 @@ def test_keyframes_follow_the_way_and_know_their_motion(make: Make) -> None:
         np.testing.assert_allclose(this.motion_covariance, expected, rtol=1e-5, atol=1e-12)
 
 
-def test_the_cloud_is_in_the_base_frame_and_described(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_the_cloud_is_in_the_base_frame_and_described(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     fed.step(0)
     made = keyframe_from_message(fed.keyframes[0])
     whole = messages.cloud_from_message(drive.scan(0)).transformed(drive.T_BASE_LIDAR)
@@ -69,15 +62,15 @@ def test_the_cloud_is_in_the_base_frame_and_described(make: Make) -> None:
     assert distance.max() < 1e-4  # measured points, not means
     assert made.descriptor_method == 'lcdnet'
     assert np.linalg.norm(made.descriptor) == pytest.approx(1.0, abs=1e-5)
-    fed = Fed(make(LoopClosureNode, threaded=False, descriptor__method='scan_context'))
+    fed = Fed(make_often(LoopClosureNode, threaded=False, descriptor__method='scan_context'))
     fed.step(0)
     made = keyframe_from_message(fed.keyframes[0])
     assert made.descriptor_method == 'scan_context'
     np.testing.assert_array_equal(made.descriptor, ScanContext().describe(whole))
 
 
-def test_clouds_wait_for_odometry_and_interpolate(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_clouds_wait_for_odometry_and_interpolate(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     fed.lockstep.feed('/odom', drive.odom_message(0))
     between = drive.scan(1, stamp_ns=drive.stamp(0) + drive.STEP_NS // 4)
     fed.lockstep.feed('/points', between)
@@ -89,8 +82,8 @@ def test_clouds_wait_for_odometry_and_interpolate(make: Make) -> None:
     )
 
 
-def test_without_odometry_clouds_are_dropped_counted_and_bounded(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False, waiting_clouds=3))
+def test_without_odometry_clouds_are_dropped_counted_and_bounded(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False, waiting_clouds=3))
     for step in range(10):
         fed.lockstep.feed('/points', drive.scan(step, count=40))
     assert fed.counted('rejected points: odometry did not come') == 7
@@ -99,17 +92,17 @@ def test_without_odometry_clouds_are_dropped_counted_and_bounded(make: Make) -> 
 
 @pytest.mark.parametrize('covariance', [True, False])
 def test_odometry_without_covariance_gives_motions_of_unknown_one(
-    make: Make, covariance: bool
+    make_often: Make, covariance: bool
 ) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     for step in range(4):
         fed.step(step, covariance=covariance)
     known = keyframe_from_message(fed.keyframes[1]).motion_covariance is not None
     assert known is covariance
 
 
-def test_without_the_transform_nothing_is_guessed(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False), transform=False)
+def test_without_the_transform_nothing_is_guessed(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False), transform=False)
     fed.step(0)
     fed.step(1)
     assert fed.keyframes == []
@@ -123,8 +116,8 @@ def test_without_the_transform_nothing_is_guessed(make: Make) -> None:
     assert fed.node.diagnostics.status().level == DiagnosticStatus.OK
 
 
-def test_broken_input_is_counted_and_survived(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_broken_input_is_counted_and_survived(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     broken = drive.odom_message(0)
     broken.pose.pose.position.x = float('nan')
     fed.lockstep.feed('/odom', broken)
@@ -148,8 +141,8 @@ def test_broken_input_is_counted_and_survived(make: Make) -> None:
     assert len(fed.keyframes) == 1
 
 
-def test_a_looped_bag_starts_again(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_a_looped_bag_starts_again(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     for _ in range(2):
         for step in range(0, 30, 3):
             fed.step(step)
@@ -157,8 +150,8 @@ def test_a_looped_bag_starts_again(make: Make) -> None:
     assert fed.counted('clock jumps in odom') == 1
 
 
-def test_a_looped_bag_is_refused_until_reset(make: Make) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False, on_time_jump='refuse'))
+def test_a_looped_bag_is_refused_until_reset(make_often: Make) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False, on_time_jump='refuse'))
     for _ in range(2):
         for step in range(0, 30, 3):
             fed.step(step)
@@ -174,9 +167,9 @@ def test_a_looped_bag_is_refused_until_reset(make: Make) -> None:
 
 
 def test_a_slow_search_drops_the_oldest_and_no_keyframe(
-    make: Make, spin_until: Callable[..., bool], monkeypatch: pytest.MonkeyPatch
+    make_often: Make, spin_until: Callable[..., bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = make(LoopClosureNode, waiting_searches=2)
+    node = make_often(LoopClosureNode, waiting_searches=2)
     free, searched, remembered = threading.Event(), [], []
 
     def slow(job: Any) -> list[Any]:
@@ -201,9 +194,9 @@ def test_a_slow_search_drops_the_oldest_and_no_keyframe(
 
 
 def test_scans_that_wait_to_become_keyframes_are_in_the_diagnostics(
-    make: Make, spin_until: Callable[..., bool], monkeypatch: pytest.MonkeyPatch
+    make_often: Make, spin_until: Callable[..., bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = make(LoopClosureNode, descriptor__method='scan_context')
+    node = make_often(LoopClosureNode, descriptor__method='scan_context')
     free, begun = threading.Event(), threading.Event()
 
     def slow(*given: Any) -> None:
@@ -231,9 +224,9 @@ def test_scans_that_wait_to_become_keyframes_are_in_the_diagnostics(
 
 
 def test_positions_of_the_graph_reach_the_search(
-    make: Make, monkeypatch: pytest.MonkeyPatch
+    make_often: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     jobs: list[Any] = []
 
     def note(job: Any) -> list[Any]:
@@ -249,10 +242,10 @@ def test_positions_of_the_graph_reach_the_search(
     np.testing.assert_array_equal(jobs[0].sensor_origin, drive.T_BASE_LIDAR[:3, 3])
 
 
-def test_namespaces_remaps_and_several_in_one_process(make: Make) -> None:
+def test_namespaces_remaps_and_several_in_one_process(make_often: Make) -> None:
     remap = ['--ros-args', '-r', 'points:=/velodyne_points']
-    left = Fed(make(LoopClosureNode, namespace='left', threaded=False), '/left/')
-    right = make(LoopClosureNode, namespace='right', cli_args=remap, threaded=False)
+    left = Fed(make_often(LoopClosureNode, namespace='left', threaded=False), '/left/')
+    right = make_often(LoopClosureNode, namespace='right', cli_args=remap, threaded=False)
     left.step(0)
     assert len(left.keyframes) == 1
     assert left.keyframes[0].header.frame_id == 'odom'
@@ -262,16 +255,16 @@ def test_namespaces_remaps_and_several_in_one_process(make: Make) -> None:
     assert {'/right/keyframe', '/right/loop_constraint'} <= {p.topic_name for p in right.publishers}
 
 
-def test_the_reliable_parameter_asks_for_every_cloud(make: Make) -> None:
+def test_the_reliable_parameter_asks_for_every_cloud(make_often: Make) -> None:
     for reliable, profile in ((False, qos.SENSOR), (True, qos.SENSOR_RELIABLE)):
-        node = make(LoopClosureNode, threaded=False, reliable_points=reliable)
+        node = make_often(LoopClosureNode, threaded=False, reliable_points=reliable)
         (points,) = [s for s in node.subscriptions if s.topic_name == '/points']
         assert points.msg_type is PointCloud2
         assert points.qos_profile.reliability == profile.reliability
 
 
-def test_loading_what_is_no_map_changes_nothing(make: Make, tmp_path: Path) -> None:
-    fed = Fed(make(LoopClosureNode, threaded=False))
+def test_loading_what_is_no_map_changes_nothing(make_often: Make, tmp_path: Path) -> None:
+    fed = Fed(make_often(LoopClosureNode, threaded=False))
     fed.step(0)
     answer = fed.node.on_load_map(LoadMap.Request(path=str(tmp_path)), LoadMap.Response())
     assert not answer.success
@@ -280,11 +273,11 @@ def test_loading_what_is_no_map_changes_nothing(make: Make, tmp_path: Path) -> N
     assert [m.id for m in fed.keyframes] == [0, 1]
 
 
-def test_a_wrong_parameter_is_named(make: Make) -> None:
+def test_a_wrong_parameter_is_named(make_often: Make) -> None:
     with pytest.raises(ConfigError, match='on_time_jump must be one of restart, refuse'):
-        make(LoopClosureNode, on_time_jump='panic')
+        make_often(LoopClosureNode, on_time_jump='panic')
     with pytest.raises(ConfigError, match=r'keyframes\.distance'):
-        make(LoopClosureNode, keyframes__distance=0.0)
+        make_often(LoopClosureNode, keyframes__distance=0.0)
 
 
 def test_a_missing_parameter_file_is_named_without_a_traceback() -> None:

@@ -10,7 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from lcd_common import se3
 from lcd_common.nodes.messages import header, pose_message
-from lcd_loop_closure.nodes.path_message import PathWriter, path_bytes, quaternions
+from lcd_loop_closure.nodes.path_message import PathWriter, quaternions
 
 pytestmark = pytest.mark.ros
 
@@ -62,7 +62,7 @@ def _padding(count: int, name_length: int) -> list[int]:
 def test_bytes_are_those_of_rclpy(count: int, length: int) -> None:
     T, stamps = _poses(count)
     frame_id = 'some_frame'[:length]
-    ours = bytearray(path_bytes(T, stamps, 5_000_000_007, frame_id))
+    ours = bytearray(PathWriter(frame_id).write(T, stamps, 5_000_000_007))
     message = _message(T, stamps, 5_000_000_007, frame_id)
     theirs = bytearray(serialize_message(message))
     assert len(ours) == len(theirs)
@@ -94,13 +94,13 @@ def test_a_path_written_again_is_the_one_written_anew() -> None:
         T[moved] = _poses(3, seed=count)[0]
         if count == 12:  # another map, whose poses may be where the last one's were
             stamps = stamps + 7
-        expected = path_bytes(T[:count], stamps[:count], count, 'map')
+        expected = PathWriter('map').write(T[:count], stamps[:count], count)
         assert writer.write(T[:count], stamps[:count], count) == expected
 
 
 def test_ten_thousand_poses_survive() -> None:
     T, stamps = _poses(10_000)
-    read = deserialize_message(path_bytes(T, stamps, 1, 'map'), Path)
+    read = deserialize_message(PathWriter('map').write(T, stamps, 1), Path)
     assert len(read.poses) == 10_000
     last = read.poses[-1]
     assert last.header.stamp.sec * 10**9 + last.header.stamp.nanosec == stamps[-1]

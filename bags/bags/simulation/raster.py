@@ -53,7 +53,7 @@ class LidarRaster:
         self._reach = (self._corners - self._centre[:, None]).norm(dim=2).amax(1)
         self._materials = self._on_device(mesh.materials.astype(np.int64))
         self._labels = self._on_device(mesh.labels.astype(np.int64))
-        self.look_with(model)
+        self._prepare(model)
 
     def look_with(self, model: LidarModel) -> None:
         """Use another LiDAR from now on.
@@ -61,16 +61,18 @@ class LidarRaster:
         Raises:
             ConfigError: its beams do not come from top to bottom.
         """
-        if model is getattr(self, 'model', None):
-            return
-        self.model = model
-        self._calibrated: dict[int, torch.Tensor] = {}
-        directions = np.ascontiguousarray(model.directions().reshape(-1, 3), np.float32)
-        self._directions = self._on_device(directions)
+        if model is not self.model:
+            self._prepare(model)
+
+    def _prepare(self, model: LidarModel) -> None:
         tangent = np.tan(model.elevation_rad)
         if not np.all(np.diff(tangent) < 0):
             raise ConfigError(f'the beams of {model.name} must come from top to bottom')
+        self.model = model
         self._falling = self._on_device(-tangent.astype(np.float32))
+        directions = np.ascontiguousarray(model.directions().reshape(-1, 3), np.float32)
+        self._directions = self._on_device(directions)
+        self._calibrated: dict[int, torch.Tensor] = {}
 
     @property
     def directions(self) -> torch.Tensor:

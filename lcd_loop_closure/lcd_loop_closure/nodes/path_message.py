@@ -16,13 +16,6 @@ _ENCAPSULATION = b'\x00\x01\x00\x00'
 _POSE = 7 * 8  # position x y z, orientation x y z w
 
 
-def path_bytes(
-    T_frame_body: se3.Array, stamps_ns: NDArray[np.int64], stamp_ns: int, frame_id: str
-) -> bytes:
-    """Return a nav_msgs/Path in CDR; arguments as of `PathWriter`."""
-    return PathWriter(frame_id).write(T_frame_body, stamps_ns, stamp_ns)
-
-
 class PathWriter:
     """Write one path after another, each time only the poses that changed."""
 
