@@ -13,7 +13,7 @@ from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.journey import Journey
 from bags.simulation.lidar_model import LIDARS
 from bags.simulation.raster import LidarRaster
-from bags.simulation.stream import TEST_SEEDS, measured_sweep
+from bags.simulation.stream import TEST_SEEDS, measured_sweeps
 from bags.simulation.town import SimulatedTown
 from lcd_common import se3
 
@@ -39,21 +39,23 @@ def evaluate(work: Path, sweeps: int = 100, frames: int = 40) -> dict[str, Any]:
         'points_per_sweep': float(np.mean(points)),
         'rays_per_sweep': LIDARS['hdl64'].rays,
         'camera_frames_per_second_cpu': 1.0 / frame_s,
-        'sweeps_per_second_torch_cpu': _torch_rate('cpu', 20),
-        'sweeps_per_second_gpu': _torch_rate('cuda', 500) if torch.cuda.is_available() else None,
+        'sweeps_per_second_torch_cpu': _torch_rate('cpu', 20, 1),
+        'sweeps_per_second_gpu': _torch_rate('cuda', 512, 16)
+        if torch.cuda.is_available()
+        else None,
     }
 
 
-def _torch_rate(device: str, sweeps: int) -> float:
+def _torch_rate(device: str, sweeps: int, batch: int) -> float:
     town, rng = SimulatedTown(TEST_SEEDS[0]), np.random.default_rng(0)
     journey = Journey(town.streets, town.ground, JourneyConfig(length=300.0), seed=0, run=0)
     raster = LidarRaster(town.scene(0), LIDARS['hdl64'], device)
     times = np.linspace(0.0, journey.duration_s, sweeps)
     poses = journey.T_world_base(times) @ _UP
-    points, _ = measured_sweep(raster, poses[0], 0.0, rng)
+    measured_sweeps(raster, poses[:batch], times[:batch], rng)
     begin = time.perf_counter()
-    for T, time_s in zip(poses, times, strict=True):
-        points, _ = measured_sweep(raster, T, float(time_s), rng)
+    for k in range(0, sweeps, batch):
+        points, _ = measured_sweeps(raster, poses[k : k + batch], times[k : k + batch], rng)[-1]
     float(points.sum())  # waits for the device
     return sweeps / (time.perf_counter() - begin)
 

@@ -49,9 +49,25 @@ TABLES: dict[str, Table] = {
         Row('— wrong loops accepted', '{:.0f}', ('false_loops.wrong_accepted',), '0'),
         Row('U-turn that breaks odometry: ATE, ours / KISS-SLAM', '{:.2f} / {:.2f} m',
             ('u_turn.ate_m', 'u_turn.kiss_slam_ate_m'), 'below the peer'),
-        Row('One graph update at 10,000 keyframes, 99 %', '{:.1f} ms',
+        Row("— the peer's broken odometry given to our loops and graph: ATE before / after",
+            '{:.2f} / {:.2f} m', ('u_turn.broken.odometry_ate_m', 'u_turn.broken.ate_m')),
+        *(
+            Row(f'{drive}, ours / KISS-SLAM: ATE', '{:.2f} / {:.2f} m',
+                (f'peers.suite.{key}.ate_m', f'peers.kiss_slam.{key}.ate_m'))
+            for key, drive in (('out_and_back', 'Out-and-back drive'), ('street_loop', 'A street'))
+        ),
+        Row('— loops right and wrong, out and back', '{:.0f} and {:.0f} / {:.0f} and {:.0f}',
+            tuple(f'peers.{of}.out_and_back.loops_{kind}'
+                  for of in ('suite', 'kiss_slam') for kind in ('right', 'wrong'))),
+        Row('— time of a scan, out and back', '{:.0f} / {:.0f} ms',
+            ('peers.suite.out_and_back.ms_per_scan', 'peers.kiss_slam.out_and_back.ms_per_scan')),
+        Row('One graph update with loops and Path at 10,000 keyframes, 99 %', '{:.1f} ms',
             ('graph_update_p99_ms_at_10000',), '≤ 50 ms'),
-        Row('Memory of a keyframe', '{:.1f} kB', ('memory.bytes_per_keyframe',), '', 1e-3),
+        Row('An hour of replay: keyframes', '{:.0f}', ('memory.keyframes',)),
+        Row('— growth of the processes for each keyframe, cloud and descriptor included',
+            '{:.0f} kB', ('memory.bytes_per_keyframe',), '', 1e-3),
+        Row('— growth without keyframes, an hour', '{:.1f} MB',
+            ('memory.without_keyframes_growth_mb_per_hour',), '0'),
     )),
     'lcdnet': Table('lcdnet', (
         Row('Average precision, protocol 1, same way / reverse: LCDNet', '{:.3f} / {:.3f}',

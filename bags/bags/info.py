@@ -124,6 +124,7 @@ def _mounting(mounting: Mounting) -> str:
 def _sweep(scan: LidarScan) -> str:
     cloud = scan.cloud
     fields = 'x y z' + (' intensity' if cloud.intensity is not None else '')
+    fields += ' label' if cloud.label is not None else ''
     if cloud.time_s is None:
         time = 'no time per point'
     else:

@@ -1,6 +1,7 @@
 """Read sequences of the KITTI odometry benchmark, also in SemanticKITTI's layout.
 
-    ROOT/sequences/00/{velodyne/NNNNNN.bin, image_2/NNNNNN.png, calib.txt, times.txt, poses.txt}
+    ROOT/sequences/00/{velodyne/NNNNNN.bin, labels/NNNNNN.label, image_2/NNNNNN.png, calib.txt,
+                       times.txt, poses.txt}
     ROOT/poses/00.txt
 
 File NNNNNN belongs to row NNNNNN of times and poses, so a sequence may have gaps. The sweeps are
@@ -9,6 +10,7 @@ both give the left camera's pose P, and the velodyne's is inv(Tr) P Tr.
 """
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,13 @@ from numpy.typing import NDArray
 from bags.calibration_file import CalibrationFile
 from bags.folder_drive import FolderDrive
 from bags.kitti_car import EPOCH_NS, base_from_lidar, camera_of_projection, mounted
-from bags.numbered_files import image_size, numbered_files, read_float32_cloud, read_image
+from bags.numbered_files import (
+    image_size,
+    numbered_files,
+    read_float32_cloud,
+    read_image,
+    read_labels,
+)
 from bags.records import CameraImage, CameraModel, LidarScan, Mounting, Record
 from bags.sensor_stream import SensorStream, make_stream
 from bags.skips import Skips
@@ -154,9 +162,13 @@ def _files_stream(
     if not timed:
         raise DataError(f'{folder}: no file number has a row in times.txt ({len(times_ns)} rows)')
 
+    labels = folder.parent / 'labels'
+
     def read(entry: int, stamp_ns: int) -> Record:
         if kind is LidarScan:
-            return LidarScan(stamp_ns, read_float32_cloud(files[entry]))
+            cloud = read_float32_cloud(files[entry])
+            label = read_labels(labels / f'{entry:06d}.label', len(cloud), skips)
+            return LidarScan(stamp_ns, replace(cloud, label=label))
         return CameraImage(stamp_ns, read_image(files[entry]))
 
     return make_stream(kind, str(folder), times_ns[timed], timed, read, skips)

@@ -50,6 +50,22 @@ def read_float32_cloud(path: Path) -> PointCloud:
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
+def read_labels(path: Path, points: int, skips: Skips) -> NDArray[np.uint16] | None:
+    """Read SemanticKITTI's labels [N] of a sweep, or return None where it has none.
+
+    Labels that do not fit the sweep are counted and left out; the sweep stays.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    if len(data) != 4 * points:
+        message = f'{path}: {len(data)} bytes for {points} points; labels have 4 bytes a point'
+        skips.add('labels that do not fit their scan', path, message)
+        return None
+    return (np.frombuffer(data, '<u4') & 0xFFFF).astype(np.uint16)
+
+
 def read_text_cloud(path: Path) -> PointCloud:
     """Read a text file of `x y z reflectance` rows (KITTI's unsynchronised sweeps).
 

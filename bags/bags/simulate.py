@@ -67,6 +67,10 @@ def add_parser(commands: Any) -> None:
         'several sectors')  # fmt: skip
     add('--point-time', action='store_true',
         help='sweep while driving, each point with its time; else deskewed')  # fmt: skip
+    add('--dual-return', action='store_true',
+        help='a point of each of two surfaces in a beam; else of the stronger')  # fmt: skip
+    add('--no-labels', action='store_true',
+        help="leave out each point's label (SemanticKITTI's numbers; 252 to 259 move)")  # fmt: skip
     add(
         '--camera', action='store_true', help="KITTI's left colour camera, an image with each sweep"
     )
@@ -82,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
     """Do what the command line says."""
     if args.town < 0 or args.first_run < 0 or args.runs < 1:
         raise ConfigError('--town and --first-run must be at least 0 and --runs at least 1')
-    if args.format == 'kitti' and (args.imu or args.gnss or args.point_time):
+    if args.format == 'kitti' and (args.imu or args.gnss or args.point_time or args.no_labels):
         raise ConfigError(
-            "KITTI's odometry layout has no place for --imu, --gnss and --point-time; "
-            'leave them out or write --format mcap'
+            "KITTI's odometry layout has no place for --imu, --gnss and --point-time, and always "
+            'has labels; leave these options out or write --format mcap'
         )
     drives = _drives(args)
     for number, drive in enumerate(drives):
@@ -124,6 +128,8 @@ def _drives(args: argparse.Namespace) -> 'list[SimulatedDrive]':
         lidar=args.sensor,
         blocked=tuple(azimuth for sector in args.blocked for azimuth in sector),
         point_time=args.point_time,
+        dual_return=args.dual_return,
+        labels=not args.no_labels,
         camera=args.camera,
         imu=args.imu,
         gnss=args.gnss,

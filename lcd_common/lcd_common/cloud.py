@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from lcd_common import se3
 from lcd_common.errors import DataError
 
+_FIRST_MOVING = 252  # SemanticKITTI: 252 to 259 are what 10 to 49 are, but moving
+
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -19,16 +21,19 @@ class PointCloud:
         intensity: [N] float32 as the sensor gives it (KITTI: 0..1), or None.
         time_s: [N] float32, seconds after the sweep's stamp (negative before it), or None where the
             sensor does not say; never invented.
+        label: [N] uint16, what a point lies on by SemanticKITTI's numbers (252 to 259 move), or
+            None where nobody says it. Only data sets and simulators do.
     """
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32] | None = None
     time_s: NDArray[np.float32] | None = None
+    label: NDArray[np.uint16] | None = None
 
     def __post_init__(self) -> None:
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
             raise DataError(f'points must have the shape N x 3, got {self.xyz.shape}')
-        for name in ('intensity', 'time_s'):
+        for name in ('intensity', 'time_s', 'label'):
             values = getattr(self, name)
             if values is not None and values.shape != (len(self.xyz),):
                 raise DataError(
@@ -40,12 +45,18 @@ class PointCloud:
         return len(self.xyz)
 
     def select(self, mask_or_index: NDArray[Any]) -> 'PointCloud':
-        """Return the chosen points with their intensity and time."""
+        """Return the chosen points with their intensity, time and label."""
         return PointCloud(
             self.xyz[mask_or_index],
             None if self.intensity is None else self.intensity[mask_or_index],
             None if self.time_s is None else self.time_s[mask_or_index],
+            None if self.label is None else self.label[mask_or_index],
         )
+
+    @property
+    def moving(self) -> NDArray[np.bool_] | None:
+        """Whether each point [N] lies on something that moves, None where there are no labels."""
+        return None if self.label is None else self.label >= _FIRST_MOVING
 
     def finite(self) -> 'PointCloud':
         """Return the points without NaN or infinite coordinates (drivers mark no return so)."""

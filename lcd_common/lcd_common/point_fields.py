@@ -19,6 +19,7 @@ _CODES = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8
 # Names drivers give to point time. Integer times are nanoseconds (Ouster `t`, Livox `offset_time`);
 # floating ones are seconds (Velodyne `time`, Hesai `timestamp`), unless they cannot be.
 TIME_FIELDS = ('t', 'time', 'timestamp', 'offset_time', 'time_offset', 'timeStamp', 'time_stamp')
+LABEL_FIELD = 'label'  # whole numbers; SemanticKITTI's class is in the lower 16 bits
 INTENSITY_FIELDS = ('intensity', 'reflectivity', 'i', 'reflectance')
 _LONGEST_SWEEP_S = 1.0
 
@@ -83,7 +84,10 @@ def cloud_from_fields(message: Any, stamp_ns: int) -> PointCloud:
         xyz[:, column] = points[axis]
     intensity = next((points[n].astype(np.float32) for n in INTENSITY_FIELDS if n in names), None)
     time_s = next((_relative_time(points[n], stamp_ns) for n in TIME_FIELDS if n in names), None)
-    return PointCloud(xyz, intensity, time_s)
+    label = None
+    if LABEL_FIELD in names and points[LABEL_FIELD].dtype.kind in 'iu':
+        label = (points[LABEL_FIELD] & 0xFFFF).astype(np.uint16)
+    return PointCloud(xyz, intensity, time_s, label)
 
 
 def _relative_time(values: NDArray[np.generic], stamp_ns: int) -> NDArray[np.float32] | None:
@@ -111,16 +115,29 @@ def layout(cloud: PointCloud) -> tuple[NDArray[np.void], list[tuple[str, int, in
     """Lay a cloud out as PointCloud2 bytes.
 
     Returns:
-        The structured array [N] (x y z, then intensity and time where known, all float32; time in
-        seconds after the stamp) and its fields as (name, offset, datatype).
+        The structured array [N] (x y z, then intensity and time where known, all float32, time in
+        seconds after the stamp; then label as uint32) and its fields as (name, offset, datatype).
     """
-    columns = [('x', cloud.xyz[:, 0]), ('y', cloud.xyz[:, 1]), ('z', cloud.xyz[:, 2])]
+    columns: list[tuple[str, NDArray[Any]]] = [
+        ('x', cloud.xyz[:, 0]),
+        ('y', cloud.xyz[:, 1]),
+        ('z', cloud.xyz[:, 2]),
+    ]
     if cloud.intensity is not None:
         columns.append(('intensity', cloud.intensity))
     if cloud.time_s is not None:
         columns.append(('time', cloud.time_s))
-    points = np.empty(len(cloud), dtype=[(name, '<f4') for name, _ in columns])
+    if cloud.label is not None:
+        columns.append((LABEL_FIELD, cloud.label))
+    # Four bytes each, labels too: floats that are not aligned are slow to read.
+    types = ['u4' if name == LABEL_FIELD else 'f4' for name, _ in columns]
+    points = np.empty(
+        len(cloud), [(name, f'<{of}') for (name, _), of in zip(columns, types, strict=True)]
+    )
     for name, values in columns:
         points[name] = values
-    fields = [(name, 4 * number, _CODES['f4']) for number, (name, _) in enumerate(columns)]
+    fields = [
+        (name, 4 * number, _CODES[of])
+        for number, ((name, _), of) in enumerate(zip(columns, types, strict=True))
+    ]
     return points, fields

@@ -295,3 +295,16 @@ def test_real_truth_is_the_published_relation(real_data: Path):
     assert lidar == pytest.approx(np.linalg.inv(Tr) @ P @ Tr, abs=1e-4)
     assert len(drive.truth()) == 4541
     assert drive.truth().length_m == pytest.approx(3724.19, rel=2e-3)  # the benchmark's length
+
+
+def test_labels_come_with_their_scans_and_misfits_are_counted(kitti, points_of):
+    folder = kitti()
+    (folder / 'labels').mkdir()
+    labels = np.arange(len(points_of(1)), dtype=np.uint32) | (5 << 16)
+    labels.tofile(folder / 'labels' / '000001.label')
+    labels[:-1].tofile(folder / 'labels' / '000002.label')
+    drive = open_kitti_odometry(folder)
+    found = [scan.cloud.label for scan in scans_of(drive)]
+    assert found[0] is None and found[2] is None
+    np.testing.assert_array_equal(found[1], labels & 0xFFFF)
+    assert drive.skipped == {'labels that do not fit their scan': 1}

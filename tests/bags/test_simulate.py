@@ -58,8 +58,24 @@ def test_a_kitti_folder_reads_as_it_was_driven(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scans[60].cloud.xyz, sweep.cloud.xyz)
     labels = np.fromfile(root / 'sequences' / '00' / 'labels' / '000060.label', np.uint32)
     np.testing.assert_array_equal(labels, sweep.label)
+    np.testing.assert_array_equal(scans[60].cloud.label, sweep.label)
+    np.testing.assert_array_equal(scans[60].cloud.moving, sweep.moving)
     assert main([*SHORT, '--format', 'kitti', '--out', str(root)]) == 1  # exists
     assert not list((root / 'sequences').glob('.*'))
+
+
+def test_labels_are_in_the_bag_unless_nobody_wants_them(tmp_path: Path) -> None:
+    for name, options in (('with', []), ('without', ['--no-labels'])):
+        assert main([*SHORT, *options, '--out', str(tmp_path / f'{name}.mcap')]) == 0
+    driven = SimulatedDrive(3, 0, JourneyConfig(length=50.0), SensorsConfig(lidar='vlp16', imu=''))
+    sweep = driven.sweep(0)
+    scan = next(iter(open_drive(tmp_path / 'with.mcap').records(kinds=(LidarScan,))))
+    assert isinstance(scan, LidarScan)
+    np.testing.assert_array_equal(scan.cloud.label, sweep.label)
+    np.testing.assert_array_equal(scan.cloud.moving, sweep.moving)
+    scan = next(iter(open_drive(tmp_path / 'without.mcap').records(kinds=(LidarScan,))))
+    assert isinstance(scan, LidarScan)
+    assert scan.cloud.label is None and len(scan.cloud) == len(sweep.cloud)
 
 
 def test_blocked_sectors_have_no_points(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,3 +131,21 @@ def test_layout_round_trip() -> None:
     np.testing.assert_array_equal(back.xyz, cloud.xyz)
     np.testing.assert_array_equal(back.intensity, cloud.intensity)
     np.testing.assert_allclose(back.time_s, cloud.time_s, atol=1e-7)
+
+
+def test_labels_come_back_as_they_went() -> None:
+    cloud = PointCloud(
+        np.ones((3, 3), np.float32), time_s=np.array([0.0, 0.1, 0.2], np.float32),
+        label=np.array([40, 252, 259], np.uint16),
+    )  # fmt: skip
+    rows, fields = layout(cloud)
+    assert fields[-1] == ('label', 16, 6) and rows.dtype.itemsize == 20
+    back = cloud_from_fields(message(rows), STAMP)
+    np.testing.assert_array_equal(back.label, cloud.label)
+    np.testing.assert_array_equal(back.moving, [False, True, True])
+    np.testing.assert_array_equal(back.select(np.array([2])).label, [259])
+    # Other people's field of that name may hold anything.
+    assert cloud_from_fields(message(points(label='f4')), STAMP).label is None
+    instances = points(label='u4')
+    instances['label'] = 10 | (7 << 16)
+    assert set(cloud_from_fields(message(instances), STAMP).label) == {10}

@@ -3,6 +3,7 @@
 import heapq
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -50,6 +51,12 @@ class SensorsConfig:
     point_time: bool = setting(
         False, 'sweep while driving and give each point its time; off: sweeps are deskewed'
     )
+    dual_return: bool = setting(
+        False, 'where a beam touches two surfaces, a point of each; off: of the stronger one'
+    )
+    labels: bool = setting(
+        True, "what each point lies on and whether it moves, SemanticKITTI's way"
+    )
     camera: bool = setting(False, 'an image with each sweep')
     imu: str = setting('rt3003', 'inertial unit; empty is none')
     imu_rate: float = setting(100.0, 'of its samples', unit='Hz', low=1.0, high=1000.0)
@@ -88,7 +95,8 @@ class SimulatedDrive:
         self.run = run
         self.sensors = sensors or SensorsConfig()
         self._receiver = receiver or ReceiverConfig()
-        self.lidar = _partly_blocked(lidar_model(self.sensors.lidar), self.sensors.blocked)
+        lidar = replace(lidar_model(self.sensors.lidar), dual_return=self.sensors.dual_return)
+        self.lidar = _partly_blocked(lidar, self.sensors.blocked)
         self._imu_model = imu_model(self.sensors.imu) if self.sensors.imu else None
         self.name = f'town_{self.town.seed}_run{run}'
         self.path = Path(self.name)
@@ -145,7 +153,10 @@ class SimulatedDrive:
 
     def scan(self, index: int) -> LidarScan:
         """Cast sweep `index` as it would be recorded."""
-        return LidarScan(self._stamp(index / self.lidar.rate_hz), self.sweep(index).cloud)
+        sweep = self.sweep(index)
+        label = sweep.label.astype(np.uint16) if self.sensors.labels else None
+        cloud = replace(sweep.cloud, label=label)
+        return LidarScan(self._stamp(index / self.lidar.rate_hz), cloud)
 
     def image(self, index: int) -> CameraImage:
         """Render the image that belongs to sweep `index`."""

@@ -1,13 +1,15 @@
 """Sweep a scene with a spinning LiDAR."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bags.simulation.hits import Hits
 from bags.simulation.lidar_measurement import (
+    Echoes,
+    Neighbours,
     Surfaces,
     beam_errors,
     calibrated_directions,
@@ -46,7 +48,7 @@ class LidarSweep:
         cloud: the points in the sensor's frame.
         label: [N] uint8, SemanticKITTI's numbers (bags.street.mesh.Label).
         moving: [N] whether the point lies on something that moves.
-        ray: [N] number of the ray, column * beams + beam.
+        ray: [N] number of the ray, column * beams + beam; one with two echoes comes twice.
     """
 
     cloud: PointCloud
@@ -94,18 +96,28 @@ class LidarSensor:
             RETURN_SHARE[hits.material].astype(np.float32).reshape(self._shape),
         )
         near = neighbours(self.model, rng.random(self._shape, np.float32))
-        echoes = measure(surfaces, near, draw(rng, self._shape), self.model, self._beam_error_m)
+        draws = draw(rng, self._shape, self.model.dual_return)
+        echoes = measure(surfaces, near, draws, self.model, self._beam_error_m)
+        parts = [self._points(e, near) for e in (echoes, echoes.weaker) if e is not None]
+        ray, surface, range_m, bright = (np.concatenate(p) for p in zip(*parts, strict=True))
+        if len(parts) > 1:  # in the order in which they come in
+            order = np.argsort(ray, kind='stable')
+            ray, surface, range_m, bright = (p[order] for p in (ray, surface, range_m, bright))
+        xyz = self._calibrated[ray] * range_m[:, None]
+        intensity = bright if self.model.has_intensity else None
+        at = self.model.column_time_s()[ray // self._shape[1]].astype(np.float32)
+        cloud = PointCloud(xyz.astype(np.float32), intensity, at if moving else None)
+        return LidarSweep(cloud, hits.label[surface], hits.mover[surface] >= 0, ray)
+
+    def _points(self, echoes: Echoes, near: Neighbours) -> tuple[NDArray[Any], ...]:
+        """Return ray, ray of the surface, range and intensity of the echoes that came back."""
         returned = np.isfinite(echoes.range_m)
         blocked = np.ones(len(returned), bool)
         blocked[self._open] = False
         returned[blocked] = False
         ray = np.flatnonzero(returned)
         surface = np.where(echoes.of_neighbour.ravel()[ray], near.index.ravel()[ray], ray)
-        xyz = self._calibrated[ray] * echoes.range_m.ravel()[ray, None]
-        intensity = echoes.intensity.ravel()[ray] if self.model.has_intensity else None
-        at = self.model.column_time_s()[ray // self._shape[1]].astype(np.float32)
-        cloud = PointCloud(xyz.astype(np.float32), intensity, at if moving else None)
-        return LidarSweep(cloud, hits.label[surface], hits.mover[surface] >= 0, ray)
+        return ray, surface, echoes.range_m.ravel()[ray], echoes.intensity.ravel()[ray]
 
     def _cast(self, T_world_lidar: se3.Array, time_s: float) -> Hits:
         """Return the hits of all rays [C * B]; those of blocked columns hit nothing."""

@@ -38,12 +38,16 @@ class Surfaces:
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers of a sweep, all [... x C x B]: two normal, two uniform in 0..1."""
+    """Random numbers of a sweep, all [... x C x B]: two normal, two uniform in 0..1.
+
+    Beams that give two echoes need numbers for the weaker one, too; `overlap` is of both.
+    """
 
     range: Any
     intensity: Any
     overlap: Any
     lost: Any
+    weaker: 'Draws | None' = None
 
 
 @dataclass(frozen=True)
@@ -54,11 +58,13 @@ class Echoes:
         range_m: measured; infinity where nothing came back.
         intensity: 0..1, corrected for the range.
         of_neighbour: whether the surface is the neighbouring ray's.
+        weaker: the other surface's echo where a beam touches two, of a LiDAR that gives both.
     """
 
     range_m: Any
     intensity: Any
     of_neighbour: Any
+    weaker: 'Echoes | None' = None
 
 
 @dataclass(frozen=True)
@@ -69,11 +75,12 @@ class Neighbours:
     spacing_rad: NDArray[np.float32]
 
 
-def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> Draws:
-    """Draw the random numbers of a sweep."""
+def draw(rng: np.random.Generator, shape: tuple[int, ...], dual: bool = False) -> Draws:
+    """Draw the random numbers of a sweep, for two echoes a ray if it is `dual`."""
     normal = rng.standard_normal((2, *shape), np.float32)
     uniform = rng.random((2, *shape), np.float32)
-    return Draws(normal[0], normal[1], uniform[0], uniform[1])
+    weaker = draw(rng, shape) if dual else None
+    return Draws(normal[0], normal[1], uniform[0], uniform[1], weaker)
 
 
 def neighbours(model: LidarModel, uniform: NDArray[np.floating]) -> Neighbours:
@@ -173,16 +180,30 @@ def measure(
     of_neighbour = other_signal > own_signal
     total = xp.clip(own_signal + other_signal, 1e-20, None)
     between = (own_signal * own_m + other_signal * other_m) / total
+    half = 0.1 / model.reach_m**2
+
+    def detected(true_m: Any, signal: Any, returns: Any, by: Draws) -> tuple[Any, Any]:
+        """Return the measured range, infinity where the echo is lost, and the intensity."""
+        share = signal**2 / (signal**2 + half**2) * returns
+        kept = (by.lost < share * (1.0 - model.dropout)) & (true_m < 0.5 * _NOWHERE_M)
+        measured_m = true_m + model.range_sigma_m * by.range + beam_error_m
+        if model.range_step_m:
+            measured_m = xp.round(measured_m / model.range_step_m) * model.range_step_m
+        kept = kept & (measured_m >= model.min_range_m) & (measured_m <= model.max_range_m)
+        bright = signal * true_m**2 + _INTENSITY_SIGMA * by.intensity
+        bright = xp.round(xp.clip(bright, 0.0, 0.99) / _INTENSITY_STEP) * _INTENSITY_STEP
+        return xp.where(kept, measured_m, xp.inf + 0.0 * far), bright
+
     true_m = xp.where(mixed, between, xp.where(of_neighbour, other_m, own_m))
     signal = xp.where(mixed, total, xp.where(of_neighbour, other_signal, own_signal))
-    half = 0.1 / model.reach_m**2
-    detected = signal**2 / (signal**2 + half**2)
-    detected = detected * xp.where(of_neighbour, neighbour(comes_back), comes_back)
-    kept = (draws.lost < detected * (1.0 - model.dropout)) & (true_m < 0.5 * _NOWHERE_M)
-    measured_m = true_m + model.range_sigma_m * draws.range + beam_error_m
-    if model.range_step_m:
-        measured_m = xp.round(measured_m / model.range_step_m) * model.range_step_m
-    kept = kept & (measured_m >= model.min_range_m) & (measured_m <= model.max_range_m)
-    bright = signal * true_m**2 + _INTENSITY_SIGMA * draws.intensity
-    bright = xp.round(xp.clip(bright, 0.0, 0.99) / _INTENSITY_STEP) * _INTENSITY_STEP
-    return Echoes(xp.where(kept, measured_m, xp.inf + 0.0 * far), bright, of_neighbour)
+    other_comes_back = neighbour(comes_back)
+    returns = xp.where(of_neighbour, other_comes_back, comes_back)
+    strongest = detected(true_m, signal, returns, draws)
+    weaker = None
+    if draws.weaker is not None:
+        true_m = xp.where(of_neighbour, own_m, other_m)
+        signal = xp.where(of_neighbour, own_signal, other_signal)
+        signal = xp.where(is_edge & ~mixed, signal, 0.0 * far)
+        returns = xp.where(of_neighbour, comes_back, other_comes_back)
+        weaker = Echoes(*detected(true_m, signal, returns, draws.weaker), ~of_neighbour)
+    return Echoes(*strongest, of_neighbour, weaker)

@@ -25,6 +25,7 @@ class LidarModel:
         range_step_m: quantisation of ranges; 0 is none.
         divergence_rad: full angle of a beam; at edges one echo comes back, of the stronger surface
             or mixed from both.
+        dual_return: whether the weaker surface's echo comes back as a point of its own, too.
         reach_m: at which half of the returns of a 10 % reflector at normal incidence are lost.
         dropout: share of the returns lost at random.
         has_intensity: whether points carry intensity.
@@ -43,6 +44,7 @@ class LidarModel:
     elevation_bias_rad: float = 0.0
     range_step_m: float = 0.002
     divergence_rad: float = 0.002
+    dual_return: bool = False
     reach_m: float = 75.0
     dropout: float = 0.01
     has_intensity: bool = True

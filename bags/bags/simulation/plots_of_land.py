@@ -9,13 +9,20 @@ from lcd_common import se3
 class Land:
     """Rectangles of ground that are taken, beside streets that stay free."""
 
-    def __init__(self, street_points: se3.Array, half_width_m: se3.Array) -> None:
+    def __init__(
+        self,
+        street_points: se3.Array,
+        half_width_m: se3.Array,
+        squares: se3.Array | None = None,
+    ) -> None:
         """Start with all ground free.
 
         Args:
             street_points: [N x 2] along all centrelines.
             half_width_m: [N] of the street at each of them.
+            squares: [S x 3] centre and radius of squares, which stay open.
         """
+        self._squares = np.empty((0, 3)) if squares is None else squares
         self._streets = cKDTree(street_points)
         self._half_width_m = half_width_m
         self._taken = np.zeros((256, 5))  # x y length width yaw
@@ -27,12 +34,28 @@ class Land:
         distance, index = self._streets.query(points)
         return np.asarray(distance - self._half_width_m[index])
 
+    def on_square(self, points: se3.Array) -> np.ndarray:
+        """Return whether points [N x 2] are on an open square [N]."""
+        apart = np.linalg.norm(points[:, None] - self._squares[:, :2], axis=2)
+        return np.asarray((apart < self._squares[:, 2]).any(axis=1))
+
     def claim(
-        self, centre: se3.Array, length: float, width: float, yaw: float, from_kerb_m: float
+        self,
+        centre: se3.Array,
+        length: float,
+        width: float,
+        yaw: float,
+        from_kerb_m: float,
+        on_squares: bool = False,
     ) -> bool:
-        """Take a rectangle if it is free and far enough behind every kerb."""
+        """Take a rectangle if it is free, far enough behind every kerb, and off the squares.
+
+        What may stand on squares as well is asked for with `on_squares`.
+        """
         outline = _outline(centre, length, width, yaw)
         if self.from_kerb_m(outline).min() < from_kerb_m:
+            return False
+        if not on_squares and self.on_square(outline).any():
             return False
         reach = 0.5 * float(np.hypot(length, width))
         n = self._count

@@ -23,7 +23,7 @@ _EDGE = 1e-7  # rays this near an edge count as inside, so that meshes have no c
 
 @dataclass(frozen=True)
 class RasterHits:
-    """What the rays of a sweep hit, [C x B] each.
+    """What the rays of a sweep hit, [C x B] each; of several sweeps [P x C x B].
 
     Attributes:
         range_m: infinity where nothing is hit.
@@ -39,6 +39,20 @@ class RasterHits:
     material: torch.Tensor
     label: torch.Tensor
     moving: torch.Tensor
+
+
+@dataclass(frozen=True)
+class _Triangles:
+    """Triangles in reach of the poses: [K x 3 x 3] in the lidar frame, whose pose, and what of.
+
+    `number` is that of the standing mesh's triangle, -1 for a mover's.
+    """
+
+    corners: torch.Tensor
+    pose: torch.Tensor
+    number: torch.Tensor
+    material: torch.Tensor
+    label: torch.Tensor
 
 
 class LidarRaster:
@@ -85,48 +99,66 @@ class LidarRaster:
             self._calibrated[seed] = self._on_device(calibrated_directions(self.model, seed))
         return self._calibrated[seed]
 
-    def cast(self, T_world_lidar: np.ndarray, time_s: float = 0.0) -> RasterHits:
-        """Return what a sweep taken at one pose [4 x 4] and time hits."""
-        T = self._on_device(np.asarray(T_world_lidar, np.float32))
-        away = (self._centre - T[:3, 3]).norm(dim=1) - self._reach
-        near = torch.nonzero(away < self.model.max_range_m).squeeze(1)
-        corners, materials, labels = self._corners[near], self._materials[near], self._labels[near]
-        moving = self._movers(np.asarray(T_world_lidar)[:3, 3], time_s)
-        if moving is not None:
-            corners = torch.cat([corners, moving[0]])
-            materials, labels = torch.cat([materials, moving[1]]), torch.cat([labels, moving[2]])
-            near = torch.cat([near, torch.full_like(moving[1], -1)])
-        corners = (corners - T[:3, 3]) @ T[:3, :3]  # R^T (p - t), row by row
+    def cast(self, T_world_lidar: np.ndarray, time_s: float | np.ndarray = 0.0) -> RasterHits:
+        """Return what sweeps hit, all cast at once.
+
+        Args:
+            T_world_lidar: one pose [4 x 4], or several [P x 4 x 4].
+            time_s: of the sweep, or of each of them [P].
+        """
+        poses = np.asarray(T_world_lidar, np.float32).reshape(-1, 4, 4)
+        times = np.broadcast_to(np.asarray(time_s, np.float64), len(poses))
+        triangles = self._around(poses, times)
         columns, beams = self.model.columns, len(self.model.elevation_rad)
-        first_column, n_columns = self._column_window(corners)
-        first_beam, n_beams = self._beam_window(corners)
+        first_column, n_columns = self._column_window(triangles.corners)
+        first_beam, n_beams = self._beam_window(triangles.corners)
         count = n_columns * n_beams
         seen = torch.nonzero(count > 0).squeeze(1)
-        corners, count = corners[seen], count[seen]
-        window = torch.stack([first_column[seen], first_beam[seen], n_beams[seen]], 1)
-        planes = _planes(corners)
-        range_m = torch.full((columns * beams,), torch.inf, device=self.device)
-        triangle = torch.full((columns * beams,), -1, dtype=torch.int64, device=self.device)
+        count, before = count[seen], triangles.pose[seen] * (columns * beams)
+        window = torch.stack([first_column[seen], first_beam[seen], n_beams[seen], before], 1)
+        planes = _planes(triangles.corners[seen])
+        rays = len(poses) * columns * beams
+        range_m = torch.full((rays,), torch.inf, device=self.device)
+        triangle = torch.full((rays,), -1, dtype=torch.int64, device=self.device)
         for begin, end in self._pieces(count):
             self._draw(planes, window, count, begin, end, range_m, triangle)
         far = range_m > self.model.max_range_m
         range_m[far], triangle[far] = torch.inf, -1
         hit, at = triangle >= 0, triangle.clamp(min=0)
+        shape = (*np.shape(T_world_lidar)[:-2], columns, beams)
         if not len(seen):
             nothing = torch.zeros_like(triangle)
             parts = [range_m, torch.zeros_like(range_m), triangle, nothing, nothing, nothing > 0]
-            return RasterHits(*(part.view(columns, beams) for part in parts))
+            return RasterHits(*(part.view(shape) for part in parts))
         normal, number = planes[at, 3], seen[at]
-        cosine = (normal * self._directions).sum(1).abs() / normal.norm(dim=1).clamp(min=1e-12)
+        along = (normal.view(len(poses), -1, 3) * self._directions).sum(2).view(-1)
+        cosine = along.abs() / normal.norm(dim=1).clamp(min=1e-12)
         parts = [
             range_m,
             torch.where(hit, cosine, 0.0 * cosine),
-            torch.where(hit, near[number], triangle),
-            torch.where(hit, materials[number], 0 * number),
-            torch.where(hit, labels[number], 0 * number),
-            hit & (near[number] < 0),
+            torch.where(hit, triangles.number[number], triangle),
+            torch.where(hit, triangles.material[number], 0 * number),
+            torch.where(hit, triangles.label[number], 0 * number),
+            hit & (triangles.number[number] < 0),
         ]
-        return RasterHits(*(part.view(columns, beams) for part in parts))
+        return RasterHits(*(part.view(shape) for part in parts))
+
+    def _around(self, poses: np.ndarray, times_s: np.ndarray) -> '_Triangles':
+        """Return the triangles in reach of each pose, in its own frame."""
+        R, t = self._on_device(poses[:, :3, :3]), self._on_device(poses[:, :3, 3])
+        away = torch.stack([(self._centre - own).norm(dim=1) for own in t]) - self._reach
+        pose, near = torch.nonzero(away < self.model.max_range_m).unbind(1)
+        parts = [(pose, self._corners[near], near, self._materials[near], self._labels[near])]
+        for index, (T, time_s) in enumerate(zip(poses, times_s.tolist(), strict=True)):
+            moving = self._movers(T[:3, 3], time_s)
+            if moving is not None:
+                none = torch.full_like(moving[1], -1)
+                parts.append((torch.full_like(none, index), moving[0], none, moving[1], moving[2]))
+        pose, corners, number, material, label = (torch.cat(p) for p in zip(*parts, strict=True))
+        # R^T (p - t), row by row.
+        return _Triangles(
+            torch.bmm(corners - t[pose][:, None], R[pose]), pose, number, material, label
+        )
 
     def _movers(
         self, origin: np.ndarray, time_s: float
@@ -170,10 +202,11 @@ class LidarRaster:
         )
         start = torch.cumsum(number, 0) - number
         place = torch.arange(len(which), device=self.device) - start[which - begin]
-        first_column, first_beam, n_beams = window[which].unbind(1)
+        first_column, first_beam, n_beams, before = window[which].unbind(1)
         column = torch.div(place, n_beams, rounding_mode='floor')
         ray = (first_column + column) % columns * beams + first_beam + place - column * n_beams
         own, d = planes[which], self._directions[ray]
+        ray = ray + before
         sides = torch.bmm(own[:, :4], d[:, :, None]).squeeze(2)  # three edges, then the normal
         edges = sides[:, :3]
         inside = (edges >= -_EDGE).all(1) | (edges <= _EDGE).all(1)

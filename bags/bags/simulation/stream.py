@@ -12,8 +12,15 @@ import torch
 
 from bags.simulation.embree import EmbreeCaster
 from bags.simulation.lidar import LidarSensor
-from bags.simulation.lidar_measurement import Draws, Surfaces, beam_errors, measure, neighbours
-from bags.simulation.lidar_model import lidar_model
+from bags.simulation.lidar_measurement import (
+    Draws,
+    Neighbours,
+    Surfaces,
+    beam_errors,
+    measure,
+    neighbours,
+)
+from bags.simulation.lidar_model import LidarModel, lidar_model
 from bags.simulation.raster import LidarRaster
 from bags.simulation.reflectivity import REFLECTIVITY, patchiness
 from bags.simulation.street_map import StreetEdge
@@ -149,7 +156,7 @@ class SweepStream:
                         break
             # A short street may have no pose as far away as was asked.
             if len(poses) == 1 + len(apart_m):
-                yield tuple(self._sweep(held, T, sensor) for T in poses)
+                yield tuple(self._sweeps(held, poses, sensor))
 
     def sweeps(self) -> Iterator[StreamedSweep]:
         """Yield sweeps of random places without end."""
@@ -158,7 +165,7 @@ class SweepStream:
             s = float(self._rng.uniform(0.0, edge.length_m))
             sensor = str(self._rng.choice(self.settings.sensors))
             reverse = bool(self._rng.random() < 0.5)
-            yield self._sweep(held, self._pose(held.town, edge, s, reverse), sensor)
+            yield self._sweeps(held, [self._pose(held.town, edge, s, reverse)], sensor)[0]
 
     def _place(self) -> tuple[_HeldTown, StreetEdge]:
         """Draw a town that is held, and a street of it."""
@@ -173,33 +180,49 @@ class SweepStream:
         chosen = int(rng.choice(len(lengths), p=lengths / lengths.sum()))
         return held, held.town.streets.edges[chosen]
 
-    def _sweep(self, held: _HeldTown, pose: tuple[se3.Array, float], sensor: str) -> StreamedSweep:
-        rng, run = self._rng, int(self._rng.integers(self.settings.runs))
-        T, height_m = pose
-        held.sweeps += 1
+    def _sweeps(
+        self, held: _HeldTown, poses: list[tuple[se3.Array, float]], sensor: str
+    ) -> list[StreamedSweep]:
+        """Sweep a town from some poses, each in a run drawn at random."""
+        rng, settings = self._rng, self.settings
+        held.sweeps += len(poses)
         model = self.models[sensor]
-        width = float(rng.choice(self.settings.blocked_deg))
+        width = float(rng.choice(settings.blocked_deg))
         if width:
             begin = float(rng.uniform(0.0, 360.0))
             model = model.blocked(*model.blocked_deg, (begin, begin + width))
-        time_s = float(rng.uniform(0.0, 600.0))
+        runs = rng.integers(settings.runs, size=len(poses))
+        times_s = rng.uniform(0.0, 600.0, len(poses))
+        T = np.stack([pose for pose, _ in poses])
+        clouds: list[tuple[torch.Tensor, torch.Tensor] | None] = [None] * len(poses)
+        for run in np.unique(runs).tolist():
+            at = np.flatnonzero(runs == run)
+            caster = self._caster(held, run, model)
+            if isinstance(caster, LidarRaster):
+                caster.look_with(model)
+                measured = measured_sweeps(caster, T[at], times_s[at], rng)
+            else:
+                measured = [
+                    _tensors(
+                        LidarSensor(model, caster, int(rng.integers(8))), T[k], times_s[k], rng
+                    )
+                    for k in at.tolist()
+                ]
+            for k, cloud in zip(at.tolist(), measured, strict=True):
+                clouds[k] = cloud
+        return [
+            StreamedSweep(*cloud, *pose, held.town.seed, int(run), sensor)
+            for cloud, pose, run in zip(clouds, poses, runs, strict=True)
+            if cloud is not None
+        ]
+
+    def _caster(self, held: _HeldTown, run: int, model: LidarModel) -> EmbreeCaster | LidarRaster:
         if run not in held.casters:
             scene = held.town.scene(run)
             held.casters[run] = (
                 EmbreeCaster(scene) if self._embree else LidarRaster(scene, model, self.device)
             )
-        caster = held.casters[run]
-        if isinstance(caster, LidarRaster):
-            caster.look_with(model)
-            xyz, intensity = measured_sweep(caster, T, time_s, rng)
-        else:
-            cloud = LidarSensor(model, caster, int(rng.integers(8))).sweep(T, time_s, rng).cloud
-            xyz = torch.from_numpy(cloud.xyz)
-            values = (
-                np.zeros(len(cloud), np.float32) if cloud.intensity is None else cloud.intensity
-            )
-            intensity = torch.from_numpy(values.astype(np.float32))
-        return StreamedSweep(xyz, intensity, T, height_m, held.town.seed, run, sensor)
+        return held.casters[run]
 
     def _pose(
         self, town: SimulatedTown, edge: StreetEdge, s: float, reverse: bool
@@ -227,39 +250,63 @@ def _use_embree(caster: str, device: torch.device) -> bool:
     return device.type == 'cpu' and find_spec('open3d') is not None
 
 
-def measured_sweep(
-    raster: LidarRaster, T_world_lidar: se3.Array, time_s: float, rng: np.random.Generator
+def _tensors(
+    lidar: LidarSensor, T_world_lidar: se3.Array, time_s: float, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cast and measure one sweep; return points [N x 3], lidar frame, and intensity [N]."""
+    cloud = lidar.sweep(T_world_lidar, time_s, rng).cloud
+    intensity = np.zeros(len(cloud), np.float32) if cloud.intensity is None else cloud.intensity
+    return torch.from_numpy(cloud.xyz), torch.from_numpy(intensity.astype(np.float32))
+
+
+def measured_sweeps(
+    raster: LidarRaster, T_world_lidar: se3.Array, time_s: se3.Array, rng: np.random.Generator
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Cast and measure sweeps at poses [P x 4 x 4] and times [P], all at once.
+
+    Returns:
+        Of each sweep, its points [N x 3] in the lidar frame and their intensity [N].
+    """
     model, device = raster.model, raster.device
     hits = raster.cast(T_world_lidar, time_s)
     shape = hits.range_m.shape
     generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
-    normal = torch.randn((2, *shape), generator=generator, device=device)
-    uniform = torch.rand((2, *shape), generator=generator, device=device)
-    to_device = {'dtype': torch.float32, 'device': device}
-    reflectivity = torch.as_tensor(REFLECTIVITY, **to_device)[hits.label, hits.material]  # type: ignore[call-overload]
-    R, t = (
-        torch.as_tensor(part, **to_device) for part in (T_world_lidar[:3, :3], T_world_lidar[:3, 3])
-    )  # type: ignore[call-overload]
-    finite = torch.where(torch.isfinite(hits.range_m), hits.range_m, 0.0 * normal[0])
-    xyz_world = (finite[..., None] * raster.directions) @ R.T + t
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        dtype = torch.float32 if array.dtype.kind == 'f' else None
+        return torch.as_tensor(array, dtype=dtype, device=device)
+
+    def drawn(weaker: Draws | None = None) -> Draws:
+        normal = torch.randn((2, *shape), generator=generator, device=device)
+        uniform = torch.rand((2, *shape), generator=generator, device=device)
+        return Draws(normal[0], normal[1], uniform[0], uniform[1], weaker)
+
+    reflectivity = tensor(REFLECTIVITY)[hits.label, hits.material]
+    R, t = tensor(T_world_lidar[:, :3, :3]), tensor(T_world_lidar[:, :3, 3])
+    finite = torch.where(torch.isfinite(hits.range_m), hits.range_m, 0.0 * hits.range_m.new_ones(1))
+    along = (raster.directions.reshape(1, -1, 3) @ R.mT).view(*shape, 3)
+    xyz_world = finite[..., None] * along + t[:, None, None]
     surfaces = Surfaces(
         hits.range_m,
         hits.incidence,
         (reflectivity * patchiness(xyz_world, torch)).clamp(0.02, 1.0),
-        torch.as_tensor(RETURN_SHARE, **to_device)[hits.material],  # type: ignore[call-overload]
+        tensor(RETURN_SHARE)[hits.material],
     )
-    near = neighbours(model, rng.random(shape, np.float32))
-    near = type(near)(
-        torch.as_tensor(near.index, device=device),
-        torch.as_tensor(near.spacing_rad, device=device),
-    )
-    seed = int(rng.integers(8))
-    beam_error_m = torch.as_tensor(beam_errors(model, seed), **to_device)  # type: ignore[call-overload]
-    draws = Draws(normal[0], normal[1], uniform[0], uniform[1])
+    near = neighbours(model, rng.random(shape[1:], np.float32))
+    before = torch.arange(shape[0], device=device)[:, None, None] * (shape[1] * shape[2])
+    near = Neighbours(tensor(near.index) + before, tensor(near.spacing_rad))
+    seeds = rng.integers(8, size=shape[0]).tolist()
+    beam_error_m = tensor(np.stack([beam_errors(model, seed) for seed in seeds]))[:, None]
+    draws = drawn(drawn() if model.dual_return else None)
     echoes = measure(surfaces, near, draws, model, beam_error_m, torch)
-    returned = torch.isfinite(echoes.range_m)
-    returned &= torch.as_tensor(model.open_columns(), device=device)[:, None]
-    xyz = raster.calibrated(seed)[returned] * echoes.range_m[returned][:, None]
-    return xyz, echoes.intensity[returned]
+    is_open = tensor(model.open_columns())[:, None]
+    both = [echoes] if echoes.weaker is None else [echoes, echoes.weaker]
+    sweeps = []
+    for index, seed in enumerate(seeds):
+        xyz, intensity = [], []
+        for echo in both:
+            range_m = echo.range_m[index]
+            returned = torch.isfinite(range_m) & is_open
+            xyz.append(raster.calibrated(seed)[returned] * range_m[returned][:, None])
+            intensity.append(echo.intensity[index][returned])
+        sweeps.append((torch.cat(xyz), torch.cat(intensity)))
+    return sweeps

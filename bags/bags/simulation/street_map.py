@@ -13,6 +13,8 @@ _STEP_M = 2.0
 # How often a street is of a style: dense facades, gardens, trees without houses, halls, a square.
 STYLES = ('urban', 'residential', 'avenue', 'industrial', 'open')
 _STYLE_SHARES = (0.30, 0.36, 0.14, 0.12, 0.08)
+_ESTATE_SHARE = 0.28  # of the streets of a town: its repetitive district
+_SQUARES = 2
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,17 @@ class StreetEdge:
 
 @dataclass(frozen=True)
 class StreetMap:
-    """Streets as a connected graph; nodes [N x 2] metres."""
+    """Streets as a connected graph.
+
+    Attributes:
+        nodes: [N x 2] crossings and ends, metres.
+        edges: streets between them.
+        squares: [S x 3] centre and radius of open squares at crossings, metres.
+    """
 
     nodes: se3.Array
     edges: tuple[StreetEdge, ...]
+    squares: se3.Array
 
 
 def street_map(seed: int, style: str | None = None, size: int = 6) -> StreetMap:
@@ -92,15 +101,25 @@ def street_map(seed: int, style: str | None = None, size: int = 6) -> StreetMap:
     ends = np.concatenate(first).tolist(), np.concatenate(second).tolist()
     pairs: list[tuple[int, int]] = list(zip(*ends, strict=True))
     pairs = _thinned(pairs, len(nodes), rng)
+    # What lies on one side of a line was built at one time: an estate of equal houses.
+    own = np.random.default_rng([seed, 18])
+    heading = own.uniform(0.0, 2.0 * np.pi)
+    middles = np.array([(nodes[i] + nodes[j]) / 2 for i, j in pairs])
+    side = middles @ [np.cos(heading), np.sin(heading)]
+    estate = side < np.quantile(side, 0.0 if style else _ESTATE_SHARE)
     edges = []
-    for i, j in pairs:
+    for (i, j), in_estate in zip(pairs, estate.tolist(), strict=True):
         curved = 0.0 if style == 'aliased' or rng.random() < 0.45 else rng.uniform(-0.14, 0.14)
         kind = style or str(rng.choice(STYLES, p=_STYLE_SHARES))
         half = float(rng.choice([3.6, 4.5, 5.3, 6.5], p=[0.25, 0.3, 0.3, 0.15]))
+        if in_estate:
+            curved, kind, half = 0.0, 'aliased', 4.5
         edges.append(
             StreetEdge(int(i), int(j), _centreline(nodes[i], nodes[j], curved), kind, half)
         )
-    return StreetMap(nodes, tuple(edges))
+    open_at = own.choice(len(nodes), 0 if style else _SQUARES, replace=False)
+    radius = own.uniform(22.0, 34.0, (len(open_at), 1))
+    return StreetMap(nodes, tuple(edges), np.hstack([nodes[open_at], radius]))
 
 
 def _thinned(

@@ -2,6 +2,34 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+
+@dataclass(frozen=True)
+class HouseRow:
+    """What the houses on one side of a street have in common, metres.
+
+    They were built in one go along one building line; most streets look the same for a while.
+    Where they are `alike`, one is the copy of the other.
+    """
+
+    width: float
+    depth: float
+    setback: float
+    storeys: int
+    alike: bool
+
+    def house(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Draw width, depth and setback of one of them."""
+        if self.alike:
+            return self.width, self.depth, self.setback
+        off_line = 0.3 if rng.random() < 0.85 else 2.0
+        return (
+            self.width * float(rng.uniform(0.85, 1.2)),
+            self.depth * float(rng.uniform(0.85, 1.15)),
+            max(self.setback + float(rng.uniform(0.0, off_line)), 0.2),
+        )
+
 
 @dataclass(frozen=True)
 class Streetscape:
@@ -29,6 +57,16 @@ class Streetscape:
     second_row: bool = True
     hall: bool = False
 
+    def row(self, rng: np.random.Generator) -> HouseRow:
+        """Draw what the houses on one side of a street have in common."""
+        return HouseRow(
+            float(rng.uniform(*self.house_width)),
+            float(rng.uniform(*self.house_depth)),
+            float(rng.uniform(*self.setback)),
+            int(rng.integers(self.storeys[0], self.storeys[1] + 1)),
+            alike=self.house_width[0] == self.house_width[1],
+        )
+
 
 STREETSCAPES = {
     'urban': Streetscape(
@@ -36,7 +74,8 @@ STREETSCAPES = {
         hedge_gap=None, shrub_gap=(8.0, 40.0), car_gap=(0.6, 6.0),
     ),
     'residential': Streetscape(
-        house_gap=(2.0, 10.0), house_width=(7.0, 14.0), setback=(1.5, 6.5), storeys=(1, 3),
+        house_gap=(2.0, 7.0), house_width=(8.0, 16.0), setback=(1.5, 6.5), storeys=(1, 3),
+        hedge_gap=(0.5, 4.0),
     ),
     'avenue': Streetscape(
         house_gap=(25.0, 70.0), setback=(10.0, 18.0), tree_gap=(6.0, 9.0), hedge_gap=(5.0, 30.0),

@@ -16,7 +16,7 @@ from lcd_common import se3
 
 _REACH_M = 60.0
 _CELL_M = 1.0
-_FINENESS = 3  # of the leaves
+_FINENESS, _BOUGHS = 3, 40  # of trees
 _LEAVES = (1.0, 0.75, 0.45, 0.12)  # share on the trees: summer .. winter
 
 
@@ -39,7 +39,7 @@ class SimulatedTown:
         self.ground = Ground(np.random.default_rng([seed, 12]))
         points = np.concatenate([edge.centreline for edge in self.streets.edges])
         halves = [np.full(len(e.centreline), e.half_width_m) for e in self.streets.edges]
-        self._land = Land(points, np.concatenate(halves))
+        self._land = Land(points, np.concatenate(halves), self.streets.squares)
         self._points, self._half_m = points, np.concatenate(halves)
 
     def scene(self, run: int = 0) -> Scene:
@@ -86,14 +86,15 @@ class SimulatedTown:
     def _houses(
         self, mesh: MeshBuilder, edge: StreetEdge, scape: Streetscape, rng: np.random.Generator
     ) -> None:
+        if scape.house_gap is None:
+            return
         for row in range(1 + scape.second_row):
-            if scape.house_gap is None:
-                return
             for side in (1.0, -1.0):
+                like = scape.row(rng)
                 s = float(rng.uniform(0.0, 4.0)) if edge.style != 'aliased' else 2.0
                 while s < edge.length_m:
-                    width, depth = rng.uniform(*scape.house_width), rng.uniform(*scape.house_depth)
-                    back = 2.0 + rng.uniform(*scape.setback) + 24.0 * row
+                    width, depth, setback = like.house(rng)
+                    back = 2.0 + setback + 24.0 * row
                     foot, along, outward = _beside(edge, s + width / 2, side)
                     centre = foot + (edge.half_width_m + back + depth / 2) * outward
                     yaw = float(np.arctan2(along[1], along[0])) + rng.normal(0.0, 0.015)
@@ -104,7 +105,9 @@ class SimulatedTown:
                         if scape.hall:
                             _hall(mesh, at, (width, depth), facing, own)
                         else:
-                            storeys = int(own.integers(scape.storeys[0], scape.storeys[1] + 1))
+                            storeys = int(
+                                np.clip(like.storeys + own.integers(-1, 2), *scape.storeys)
+                            )
                             shapes.house(mesh, at, (width, depth), facing, own, storeys)
                     s += width + float(rng.uniform(*scape.house_gap))
 
@@ -121,7 +124,7 @@ class SimulatedTown:
             for s in _row(edge, scape.lamp_gap, rng):
                 foot, _, outward = _beside(edge, s, side)
                 at = foot + (half + 0.6) * outward
-                if self._land.claim(at, 0.3, 0.3, 0.0, 0.2):
+                if self._land.claim(at, 0.3, 0.3, 0.0, 0.2, on_squares=True):
                     own = np.random.default_rng(7 if aliased else int(rng.integers(1 << 31)))
                     shapes.lamp(mesh, self._on_ground(at), -outward, own)
             for away in (1.3, 6.5):
@@ -130,20 +133,39 @@ class SimulatedTown:
                     at = foot + (half + away + (0.0 if aliased else rng.uniform(0, 1.5))) * outward
                     own = np.random.default_rng(8 if aliased else int(rng.integers(1 << 31)))
                     if self._land.claim(at, 0.8, 0.8, 0.0, 0.4):
-                        shapes.tree(mesh, self._on_ground(at), own, leaves, _FINENESS)
+                        shapes.tree(mesh, self._on_ground(at), own, leaves, _FINENESS, _BOUGHS)
             for away in (1.8, 3.0, 9.0, 16.0):
                 for s in _row(edge, scape.shrub_gap, rng):
                     foot, _, outward = _beside(edge, s, side)
                     at = foot + (half + away + rng.uniform(-0.8, 3.0)) * outward
                     if self._land.claim(at, 0.8, 0.8, 0.0, 1.0):
                         shapes.shrub(mesh, self._on_ground(at), rng)
-            for s in _row(edge, scape.hedge_gap, rng):
-                length = float(rng.uniform(3.0, 12.0))
-                foot, along, outward = _beside(edge, s + length / 2, side)
-                at = foot + (half + rng.uniform(1.8, 3.2)) * outward
+            self._borders(mesh, edge, scape, side, rng)
+
+    def _borders(
+        self,
+        mesh: MeshBuilder,
+        edge: StreetEdge,
+        scape: Streetscape,
+        side: float,
+        rng: np.random.Generator,
+    ) -> None:
+        """Set the borders of the gardens along one side: mostly alike, in line, with gates."""
+        if scape.hedge_gap is None:
+            return
+        usual, behind = shapes.border(rng), float(rng.uniform(1.8, 3.2))
+        s = float(rng.uniform(0.0, scape.hedge_gap[1]))
+        while s < edge.length_m:
+            length = float(rng.uniform(6.0, 18.0))
+            kind = usual if rng.random() < 0.7 else shapes.border(rng)
+            for part in (length, 0.4 * length):  # something stands in the way: a shorter one
+                foot, along, outward = _beside(edge, s + part / 2, side)
+                at = foot + (edge.half_width_m + behind) * outward
                 yaw = float(np.arctan2(along[1], along[0]))
-                if self._land.claim(at, length, 0.5, yaw, 0.8):
-                    shapes.fence(mesh, self._on_ground(at), length, yaw, rng)
+                if self._land.claim(at, part, 0.5, yaw, 0.8):
+                    shapes.fence(mesh, self._on_ground(at), part, yaw, rng, kind)
+                    break
+            s += part + float(rng.uniform(*scape.hedge_gap))
 
     def _parked_cars(self, rng: np.random.Generator) -> Mesh:
         """Park cars of this run, and set up a building site or two."""
@@ -202,11 +224,13 @@ class SimulatedTown:
         nearest, farthest = behind[triangles].min(axis=1), behind[triangles].max(axis=1)
         triangles = triangles[nearest < _REACH_M]
         farthest = farthest[nearest < _REACH_M]
+        on_square = self._land.on_square(xy[triangles].mean(axis=1))
+        paved = (farthest <= 2.5) | (on_square & (farthest > 0.5))
         vertices = np.column_stack([xy, z])
         for label, material, inside in (
             (Label.ROAD, Material.ASPHALT, farthest <= 0.5),
-            (Label.SIDEWALK, Material.ASPHALT, (farthest > 0.5) & (farthest <= 2.5)),
-            (Label.TERRAIN, Material.GRASS, farthest > 2.5),
+            (Label.SIDEWALK, Material.ASPHALT, (farthest > 0.5) & paved),
+            (Label.TERRAIN, Material.GRASS, ~paved),
         ):
             mesh.label = label
             mesh.triangles(vertices, triangles[inside], material)

@@ -1,5 +1,7 @@
 """Model what stands in a street: houses with windows, cars, trees, fences, lamps."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,7 @@ from bags.street.mesh import Label, Material, MeshBuilder, turn, up
 
 Array = NDArray[np.float64]
 Quad = list[list[float]]
+_BORDERS = ('wall', 'hedge', 'pickets')
 
 
 def house(
@@ -133,11 +136,13 @@ def tree(
     rng: np.random.Generator,
     leaves_mesh: MeshBuilder | None = None,
     fineness: int = 1,
+    boughs: int = 0,
 ) -> None:
     """Add a tree: a trunk, and leaves as loose triangles in an ellipsoid or a cone.
 
     The leaves go into a mesh of their own where one is given; there are `fineness` times as many,
-    and as much smaller.
+    and as much smaller. Boughs are large triangles of leaves inside the crown: the more there are,
+    the less is seen through it.
     """
     height = rng.uniform(3.5, 11.0)
     trunk = rng.uniform(0.2, 0.45) * height
@@ -152,8 +157,10 @@ def tree(
     if rng.random() < 0.3:  # a conifer
         at[:, :2] *= 0.5 * (1.0 - at[:, 2:])
     crown = at * [radius, radius, (height - trunk) / 2] + up((height + trunk) / 2)
-    size = 0.22 / np.sqrt(fineness)
-    leaves = crown[:, None] + rng.normal(0.0, size, (count, 3, 3)) + foot
+    size = np.full(count, 0.22 / np.sqrt(fineness))
+    size[:boughs] = 0.45
+    crown[:boughs] += 0.25 * (up((height + trunk) / 2) - crown[:boughs])
+    leaves = crown[:, None] + rng.normal(0.0, 1.0, (count, 3, 3)) * size[:, None, None] + foot
     mesh = leaves_mesh or mesh
     mesh.label = Label.VEGETATION
     mesh.triangles(leaves.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), Material.LEAF)
@@ -188,18 +195,44 @@ def lamp(mesh: MeshBuilder, foot: Array, inward: Array, rng: np.random.Generator
     mesh.box(arm, (1.5, 0.15, 0.1), yaw, Material.METAL)
 
 
+@dataclass(frozen=True)
+class Border:
+    """A kind of garden border: 'wall', 'hedge' or 'pickets', and its height in metres.
+
+    Nobody sees through a `dense` hedge.
+    """
+
+    kind: str
+    height_m: float
+    dense: bool = False
+
+
+def border(rng: np.random.Generator) -> Border:
+    """Draw a kind of border; walls and hedges may be taller than a person."""
+    kind = str(rng.choice(_BORDERS, p=[0.4, 0.4, 0.2]))
+    return Border(kind, float(rng.uniform(0.8, 1.4 if kind == 'pickets' else 2.3)), dense=True)
+
+
 def fence(
-    mesh: MeshBuilder, foot: Array, length: float, yaw: float, rng: np.random.Generator
+    mesh: MeshBuilder,
+    foot: Array,
+    length: float,
+    yaw: float,
+    rng: np.random.Generator,
+    of: Border | None = None,
 ) -> None:
-    """Add a garden border: a wall, a hedge or pickets."""
+    """Add a garden border of a kind, or of any."""
+    of = of or Border(_BORDERS[int(rng.integers(3))], float(rng.uniform(0.7, 1.6)))
+    height, R = of.height_m, turn(yaw)
     mesh.label = Label.FENCE
-    kind, height = rng.integers(3), float(rng.uniform(0.7, 1.6))
-    R = turn(yaw)
-    if kind == 0:
+    if of.kind == 'wall':
         thick = float(rng.uniform(0.15, 0.35))
         mesh.box(foot + up(height / 2 - 0.2), (length, thick, height + 0.4), yaw, Material.BRICK)
-    elif kind == 1:
+    elif of.kind == 'hedge':
         mesh.label = Label.VEGETATION
+        if of.dense:
+            core = (length - 0.2, 0.4, height - 0.1)
+            mesh.box(foot + up(core[2] / 2 - 0.2), core, yaw, Material.LEAF)
         count = int(30 * length)
         at = rng.uniform([-length / 2, -0.4, 0.0], [length / 2, 0.4, height], (count, 3)) @ R.T
         leaves = at[:, None] + rng.normal(0.0, 0.12, (count, 3, 3)) + foot

@@ -33,6 +33,7 @@ examples:
   build_lidar_map DATASET --sequence 00 --labels DATASET/sequences/00/labels --out map
                                                      SemanticKITTI's labels say what moves
   build_lidar_map town:3 --labels --out map          a simulated town, which knows what moves
+  build_lidar_map town3.mcap --labels --out map      a bag whose points have a field 'label'
   build_lidar_map town:3:1 --out map                 the same again goes on with the map
 
 The map is a folder of tiles. It may be larger than memory; a map that is there already grows.
@@ -111,14 +112,15 @@ def drive_sweeps(
         poses: of base_link.
         start_ns, end_ns: the part to read, inclusive.
         every: take each so many-th sweep.
-        labels: None; '' for a simulated drive's own; else a folder of SemanticKITTI's .label files,
-            one for each sweep.
+        labels: None; '' for those in the drive itself (simulated, SemanticKITTI, bags with a field
+            'label'); else a folder of SemanticKITTI's .label files, one for each sweep.
 
     Raises:
         DataError: a sensor has no place, or labels do not fit.
     """
     places = {m.child: m.T_parent_child for m in drive.mountings}
-    for number, (scan, moving) in enumerate(_scans(drive, start_ns, end_ns, labels)):
+    for number, scan in enumerate(drive.records(start_ns, end_ns, [LidarScan])):
+        assert isinstance(scan, LidarScan)
         if number % every:
             continue
         T_map_base = poses.at(scan.stamp_ns)
@@ -129,28 +131,14 @@ def drive_sweeps(
                 f'{drive.path}: nothing says where {scan.frame_id} sits; it has '
                 f'{", ".join(places) or "no mountings"}'
             )
+        moving = None
         if labels:
             moving = _moving(Path(labels) / f'{number:06d}.label', len(scan.cloud))
+        elif labels is not None:
+            moving = scan.cloud.moving
+            if moving is None:
+                raise DataError(f'{drive.path}: its points have no labels; leave --labels out')
         yield Sweep(scan.cloud, T_map_base, places[scan.frame_id], moving)
-
-
-def _scans(
-    drive: Drive, start_ns: int | None, end_ns: int | None, labels: str | None
-) -> Iterator[tuple[LidarScan, NDArray[np.bool_] | None]]:
-    """Yield scans, with what moves where a simulated drive says it."""
-    if labels != '':
-        for record in drive.records(start_ns, end_ns, [LidarScan]):
-            assert isinstance(record, LidarScan)
-            yield record, None
-        return
-    truth = drive.truth()
-    if not hasattr(drive, 'sweep') or truth is None:
-        raise DataError('--labels without a folder is for simulated towns (town:SEED)')
-    last = np.inf if end_ns is None else end_ns
-    for index, stamp_ns in enumerate(truth.stamps_ns.tolist()):
-        if (start_ns or 0) <= stamp_ns <= last:
-            sweep = drive.sweep(index)
-            yield LidarScan(stamp_ns, sweep.cloud), sweep.moving
 
 
 def _moving(file: Path, count: int) -> NDArray[np.bool_]:
@@ -186,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--poses', type=Path, metavar='TUM', help='poses of base_link (default: ground truth)')
     add('--every', type=int, default=1, metavar='N', help='take each N-th sweep (default: 1)')
     add('--labels', nargs='?', const='', metavar='FOLDER',
-        help="SemanticKITTI's .label files; without a folder, a simulated town's own")  # fmt: skip
+        help="SemanticKITTI's .label files; without a folder, the input's own labels")  # fmt: skip
     add('--keep-moving', action='store_true', help='do not remove what sweeps saw through')
     add('--voxel', type=float, default=defaults.voxel, metavar='M', help='(default: %(default)s)')
     add('--max-range', type=float, default=defaults.max_range, metavar='M',

@@ -21,9 +21,10 @@ from bags.simulation.stream import (
     VALIDATION_SEEDS,
     StreamConfig,
     SweepStream,
-    measured_sweep,
+    measured_sweeps,
 )
 from bags.simulation.town import SimulatedTown
+from lcd_common import se3
 from lcd_common.errors import ConfigError
 
 SMALL = StreamConfig(sensors=('vlp16', 'os1_64'), sweeps_per_town=8, towns_held=1, runs=2)
@@ -82,7 +83,7 @@ def test_both_casters_measure_with_the_same_calibration() -> None:
     T, rng = np.eye(4), np.random.default_rng(0)
     T[:2, 3] = edge.at(0.5 * edge.length_m)[0]
     T[2, 3] = float(town.ground.height(T[None, :2, 3])[0]) + 1.73
-    drawn, _ = measured_sweep(LidarRaster(scene, model), T, 5.0, rng)
+    drawn, _ = measured_sweeps(LidarRaster(scene, model), T[None], np.array([5.0]), rng)[0]
     cast = LidarSensor(model, EmbreeCaster(scene)).sweep(T, 5.0, rng).cloud.xyz
     exact = LidarSensor(replace(model, elevation_bias_rad=0.0), EmbreeCaster(scene))
     true = exact.sweep(T, 5.0, rng).cloud.xyz
@@ -92,6 +93,60 @@ def test_both_casters_measure_with_the_same_calibration() -> None:
         range_m = np.linalg.norm(xyz, axis=1)
         heights.append(np.median(xyz[(np.abs(range_m - 10.0) < 2.0) & (xyz[:, 2] < -1.0), 2]))
     assert heights[:2] == pytest.approx([heights[2] - 0.065] * 2, abs=0.02)
+
+
+def test_sweeps_cast_at_once_are_those_cast_one_by_one() -> None:
+    model = replace(
+        lidar_model('vlp16'), range_sigma_m=0.0, beam_sigma_m=0.0, angle_sigma_rad=0.0, dropout=0.0,
+        divergence_rad=0.0, reach_m=1e4,
+    )  # fmt: skip
+    town = SimulatedTown(3, size=3)
+    raster, edges = LidarRaster(town.scene(0), model), town.streets.edges[:3]
+    poses = np.stack([se3.rotation_z(0.4 * k) for k in range(3)])
+    for T, edge in zip(poses, edges, strict=True):
+        T[:2, 3] = edge.at(0.5 * edge.length_m)[0]
+        T[2, 3] = float(town.ground.height(T[None, :2, 3])[0]) + 1.73
+    times = np.array([5.0, 50.0, 200.0])
+    hits = raster.cast(poses, times)
+    assert hits.range_m.shape == (3, model.columns, 16)
+    for k in range(3):
+        one = raster.cast(poses[k], times[k])
+        for name in ('range_m', 'incidence', 'triangle', 'material', 'label', 'moving'):
+            assert torch.equal(getattr(hits, name)[k], getattr(one, name)), name
+    # And measured: glass loses returns at random, what is left lies where the rays end.
+    for k, (xyz, _) in enumerate(measured_sweeps(raster, poses, times, np.random.default_rng(0))):
+        ends = (raster.directions * hits.range_m[k][..., None])[torch.isfinite(hits.range_m[k])]
+        assert 0.8 * len(ends) < len(xyz) <= len(ends)
+        assert cKDTree(ends.numpy()).query(xyz.numpy())[0].max() < 0.002
+
+
+@pytest.mark.parametrize('by_torch', [True, False])
+def test_two_echoes_are_those_of_one_and_the_surfaces_behind(by_torch: bool) -> None:
+    model = replace(lidar_model('os1_64'), dropout=0.0)
+    town = SimulatedTown(3, size=3)
+    edge, T = town.streets.edges[0], np.eye(4)
+    T[:2, 3] = edge.at(0.5 * edge.length_m)[0]
+    T[2, 3] = float(town.ground.height(T[None, :2, 3])[0]) + 1.73
+    scene, counts = town.scene(0), []
+    for dual in (False, True):
+        lidar = replace(model, dual_return=dual)
+        if by_torch:
+            raster = LidarRaster(scene, lidar)
+            rng = np.random.default_rng(0)
+            counts.append(len(measured_sweeps(raster, T[None], np.zeros(1), rng)[0][0]))
+            continue
+        sensor = LidarSensor(lidar, EmbreeCaster(scene))
+        sweep = sensor.sweep(T, 0.0, np.random.default_rng(0))
+        counts.append(len(sweep.cloud))
+        twice = np.flatnonzero(np.diff(sweep.ray) == 0)
+        assert np.all(np.diff(sweep.ray) >= 0)
+        if dual:
+            range_m = np.linalg.norm(sweep.cloud.xyz, axis=1)
+            # Echoes nearer to each other than a metre melt into one.
+            assert len(twice) > 100 and np.abs(range_m[twice] - range_m[twice + 1]).min() > 0.8
+        else:
+            assert not len(twice)
+    assert counts[0] * 1.003 < counts[1] < counts[0] * 1.2
 
 
 def test_the_same_seed_streams_the_same_sweeps() -> None:

@@ -93,6 +93,31 @@ def test_an_aliased_district_repeats_its_houses() -> None:
     height = walls[:, 2] - aliased.ground.height(walls[:, :2].astype(float))
     # All houses have the same few heights of wall and window pieces.
     assert len(np.unique(np.round(height, 0))) < 15
+    assert not len(aliased.streets.squares)
+
+
+def test_every_town_has_an_estate_on_one_side() -> None:
+    for seed in (0, 104, 205):
+        streets = street_map(seed)
+        alike = np.array([edge.style == 'aliased' for edge in streets.edges])
+        assert 0.1 < alike.mean() < 0.5
+        middles = np.array([edge.centreline.mean(axis=0) for edge in streets.edges])
+        # One straight line parts it from the rest, but for the bows of the streets.
+        apart = middles[alike].mean(axis=0) - middles[~alike].mean(axis=0)
+        assert np.linalg.norm(apart) > 100.0
+        assert {e.half_width_m for e in streets.edges if e.style == 'aliased'} == {4.5}
+        assert len({e.style for e in streets.edges}) >= 4
+
+
+def test_squares_are_open_and_paved(town: SimulatedTown) -> None:
+    mesh, (x, y, radius) = town.scene(0).mesh, town.streets.squares[0]
+
+    def on_square(*labels: Label) -> int:
+        return int(np.sum(np.linalg.norm(centres(mesh, *labels)[:, :2] - [x, y], axis=1) < radius))
+
+    assert on_square(Label.BUILDING, Label.TRUNK, Label.FENCE) == 0
+    paved, grass = on_square(Label.ROAD, Label.SIDEWALK), on_square(Label.TERRAIN)
+    assert paved > 0.9 * np.pi * radius**2 and grass < 0.05 * paved
 
 
 def test_every_surface_has_a_label_and_a_material(town: SimulatedTown) -> None:

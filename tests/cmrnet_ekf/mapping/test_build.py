@@ -82,7 +82,7 @@ def test_semantickitti_labels_say_what_moves(tmp_path):
     [
         (['nothing_there'], 'nothing there'),
         ([*STREET, '--every', '0'], '--every'),
-        ([*STREET, '--labels'], 'simulated towns'),
+        ([*STREET, '--labels'], 'have no labels'),
         ([*STREET, '--labels', 'no_such_folder'], '000000.label'),
         ([*STREET, '--poses', 'no_such.tum'], 'no_such.tum'),
         ([*STREET, '--voxel', '0'], 'voxel'),
