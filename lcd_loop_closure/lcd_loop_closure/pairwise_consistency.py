@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lcd_common import se3
 
 Rows = NDArray[np.int64]
+_PART = 4096  # pairs
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,15 @@ def agreeing_groups(
     count = len(loops.ends)
     if count < 2:
         return []
-    apart = np.abs(loops.ends[:, None, :] - loops.ends[None, :, :]).max(axis=2)
-    first, second = np.nonzero(np.triu(apart <= reach, k=1))
-    agree = cycle_distances(chain, loops, first, second) <= threshold
+    near = cKDTree(loops.ends).query_pairs(reach, p=np.inf, output_type='ndarray')
+    first, second = near[np.lexsort(near.T[::-1])].T
+    # In parts: a pair takes kilobytes, and on a street driven all day every loop has a hundred.
+    agree = np.concatenate(
+        [
+            cycle_distances(chain, loops, first[k : k + _PART], second[k : k + _PART]) <= threshold
+            for k in range(0, max(len(first), 1), _PART)
+        ]
+    )
     edges = coo_matrix((np.ones(agree.sum()), (first[agree], second[agree])), (count, count))
     _, labels = connected_components(edges, directed=False)
     groups = [np.nonzero(labels == label)[0] for label in np.unique(labels)]

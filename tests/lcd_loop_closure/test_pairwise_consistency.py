@@ -1,5 +1,7 @@
 """Cycles of loops and odometry are judged by the covariance that odometry really has."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -96,3 +98,29 @@ def test_groups_are_the_loops_that_agree() -> None:
     groups = agreeing_groups(ChainCovariance(poses, covariances), measured, 22.0, reach=20)
     assert [group.tolist() for group in groups] == [[0, 1, 2], [3, 4]]
     assert agreeing_groups(ChainCovariance(poses, covariances), loops_of(poses, []), 22.0) == []
+
+
+def test_many_loops_are_compared_in_little_memory_and_as_by_brute_force() -> None:
+    motions, covariances = drive(1500)
+    poses = chain(motions)
+    rng = np.random.default_rng(2)
+    ends = np.column_stack([rng.integers(0, 700, 3000), rng.integers(700, 1500, 3000)])
+    measured = loops_of(poses, [tuple(pair) for pair in ends.tolist()])
+    for wrong in rng.choice(3000, 1500, replace=False).tolist():
+        measured.T_match_query[wrong, :3, 3] += rng.uniform(20.0, 60.0, 3)
+    by = ChainCovariance(poses, covariances)
+    tracemalloc.start()
+    groups = agreeing_groups(by, measured, 22.0, reach=15)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6, 'every loop with every other one would take 140 MB'
+    agreeing = set()
+    for one in range(3000):
+        other = np.flatnonzero(np.abs(ends - ends[one]).max(axis=1) <= 15)
+        other = other[other > one]
+        near = cycle_distances(by, measured, np.full(len(other), one), other) <= 22.0
+        agreeing |= {(one, int(two)) for two in other[near]}
+    assert len(agreeing) > 1000
+    number = {loop: n for n, group in enumerate(groups) for loop in group.tolist()}
+    assert all(number[one] == number[two] for one, two in agreeing)
+    assert {loop for pair in agreeing for loop in pair} == set(number)
