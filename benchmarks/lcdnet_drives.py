@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from bags.simulation.drive import SensorsConfig, SimulatedDrive
+from bags.simulation.held_out import TEST_SETS
 from bags.simulation.stream import TEST_SEEDS
 from benchmarks.lcdnet_peers import judge_map_closures
-from benchmarks.simulated_drives import JOURNEYS, SPACING_M
+from benchmarks.simulated_drives import SPACING_M
 from lcd_common.errors import LocalizationError
 from lcd_loop_closure.evaluation.drive_sweeps import store_drive
 from lcd_loop_closure.evaluation.methods import Methods
@@ -29,6 +30,7 @@ from lcd_loop_closure.revisits import RevisitConfig
 METHODS = ('lcdnet', 'scan_context', 'scan_context_50', 'm2dp', 'isc', 'lidar_iris')
 LENGTH_M = 2500.0
 _UNSEEN = 'beams32'
+CLASSES = ('same_way', 'reverse')  # of revisits
 
 
 def methods() -> Methods:
@@ -60,7 +62,7 @@ def rendered(
     name = f'town_{seed}_{kind}_run{run}_{sensor}_{length:.0f}'
     folder = work / 'sweeps' / name
     if not is_stored(folder):
-        journey = replace(JOURNEYS[kind], length=length)
+        journey = replace(TEST_SETS[kind].journey, length=length)
         drive = SimulatedDrive(seed, run, journey, SensorsConfig(lidar=sensor, imu='', gnss=False))
         drive.name = name
         expected = int(length / SPACING_M)
@@ -72,7 +74,7 @@ def rendered(
 def detection(work: Path, towns: int = 3) -> dict[str, Any]:
     """Return average precision by protocol, class and method: means over towns, and each town's."""
     found: dict[str, dict[str, Any]] = {}
-    for kind in JOURNEYS:
+    for kind in CLASSES:
         for seed in TEST_SEEDS[:towns]:
             sweeps = rendered(work, kind, seed)
             judged = study_detection(
@@ -121,7 +123,7 @@ def changed(work: Path, length_m: float | None = None) -> dict[str, Any]:
         folder=work / 'descriptors', bar=terminal_bar,
     )['whole']  # fmt: skip
     unseen = {}
-    for kind in JOURNEYS:
+    for kind in CLASSES:
         sweeps = rendered(work, kind, seed, sensor=_UNSEEN, length_m=length_m)
         unseen[kind] = {
             f'town_{seed}': study_detection(
@@ -138,7 +140,7 @@ def changed(work: Path, length_m: float | None = None) -> dict[str, Any]:
 def sectors(work: Path, towns: int = 3, length_m: float | None = None) -> dict[str, Any]:
     """Return average precision with sectors removed at random, and with the rear blocked."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    for kind in JOURNEYS:
+    for kind in CLASSES:
         for seed in TEST_SEEDS[:towns]:
             sweeps = rendered(work, kind, seed, length_m=length_m)
             blocked = RearBlocked(sweeps)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from bags.inputs import open_input
 from bags.simulation.drive import SensorsConfig, SimulatedDrive
+from bags.simulation.held_out import TEST_SETS
 from bags.simulation.itinerary import JourneyConfig
 from bags.simulation.stream import TEST_SEEDS
-from bags.simulation.town import SimulatedTown
 from benchmarks.drives import RANGES, kitti_folder, suite_and_peer
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
@@ -23,28 +23,19 @@ from lcd_loop_closure.scan_context import ScanContext, ScanContextConfig
 _HEIGHT_M = 1.73
 _MEAN_SPEED_M_S = 6.3  # of the simulated journeys, stops included
 SPACING_M = 1.0  # KITTI's cars take a scan a metre
-# One class each, so that a class has an average precision of its own, as KITTI 00 and 08.
-JOURNEYS = {
-    'same_way': JourneyConfig(length=2500.0, same_way=0.3, reverse=0.0, lateral=1.5),
-    'reverse': JourneyConfig(length=2500.0, same_way=0.0, reverse=0.3, lateral=1.5),
-}
 
 
-def scan_context(work: Path, towns: int = 3) -> dict[str, Any]:
-    """Return Scan Context's average precision by protocol 1 on drives through test towns."""
+def scan_context(work: Path, towns: int | None = None) -> dict[str, Any]:
+    """Return Scan Context's average precision by protocol 1 on every test set."""
     del work
     figures: dict[str, Any] = {}
-    for name, journey in JOURNEYS.items():
+    for name, held_out in TEST_SETS.items():
         curves = {}
-        for seed in TEST_SEEDS[:towns]:
-            curve, places = judge(SimulatedDrive(SimulatedTown(seed), journey=journey))
-            curves[f'town_{seed}'] = {'average_precision': curve.average_precision, **places}
+        for town, drive in held_out.drives(towns).items():
+            curve, places = judge(drive)
+            curves[town] = {'average_precision': curve.average_precision, **places}
         figures[name] = float(np.mean([c['average_precision'] for c in curves.values()]))
         figures[f'{name}_by_town'] = curves
-    aliased = SimulatedDrive(SimulatedTown(TEST_SEEDS[-1], 'aliased'), journey=JOURNEYS['same_way'])
-    curve, places = judge(aliased)
-    figures['aliased_same_way'] = curve.average_precision
-    figures['aliased_same_way_by_town'] = places
     return {'scan_context_ap': figures}
 
 

@@ -24,9 +24,9 @@ def _distance(what: str, statistic: str, lacking: tuple[str, ...] = ()) -> WideR
     return WideRow(what, tuple(cells))
 
 
-def _difficulty(what: str, name: str, town: str) -> WideRow:
-    """Return a row of a set of drives; `town` is '.*' where each town has figures of its own."""
-    below = f'scan_context_ap.{name}_by_town{town}'
+def _difficulty(what: str, name: str) -> WideRow:
+    """Return a row of a test set: means over its towns."""
+    below = f'scan_context_ap.{name}_by_town.*'
     distances = ('within_a_place', 'to_most_similar_other_place', 'between_places')
     return WideRow(
         what,
@@ -76,9 +76,11 @@ TOWN_TABLES = {
     ), header=('real / simulated', *_RECORDINGS.values(), 'KITTI 00 / KITTI-360, both real'),
         section='realism'),
     'difficulty': Table('town', (
-        _difficulty('Same way', 'same_way', '.*'),
-        _difficulty('In reverse', 'reverse', '.*'),
-        _difficulty('Same way, aliased district', 'aliased_same_way', ''),
+        _difficulty('Same way', 'same_way'),
+        _difficulty('In reverse', 'reverse'),
+        _difficulty('Same way, aliased district', 'aliased_same_way'),
+        _difficulty('Same way, OS1-64', 'second_sensor_same_way'),
+        _difficulty('In reverse, OS1-64', 'second_sensor_reverse'),
     ), header=('drives', 'average precision', 'distance within a place',
                'to the most similar other place', 'between places',
                'another place is more alike'),
