@@ -99,7 +99,7 @@ def test_blocked_sectors_have_no_points(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_town_is_an_input() -> None:
     named = open_input('town:3:1')
-    assert (named.name, open_input('town').name) == ('town_3_run1', 'town_99_run0')
+    assert (named.name, open_input('town').name) == ('town_3_run1', 'town_36_run0')
     assert {s.topic for s in named.streams()} >= {'/points', '/imu', '/gps/fix'}
 
 
