@@ -35,8 +35,10 @@ REQUIRED = (
     'false_loops.wrong_accepted',
     'u_turn.ate_m',
     'u_turn.kiss_slam_ate_m',
+    'u_turn.broken.ate_m',
     'graph_update_p99_ms_at_10000',
     'memory.bytes_per_keyframe',
+    'memory.without_keyframes_growth_mb_per_hour',
     'peers.kiss_slam.*',
 )
 

@@ -52,7 +52,7 @@ TABLES: dict[str, Table] = {
         Row("— the peer's broken odometry given to our loops and graph: ATE before / after",
             '{:.2f} / {:.2f} m', ('u_turn.broken.odometry_ate_m', 'u_turn.broken.ate_m')),
         *(
-            Row(f'{drive}, ours / KISS-SLAM: ATE', '{:.2f} / {:.2f} m',
+            Row(f'{drive}, ours / KISS-SLAM: ATE', '{:.3f} / {:.3f} m',
                 (f'peers.suite.{key}.ate_m', f'peers.kiss_slam.{key}.ate_m'))
             for key, drive in (('out_and_back', 'Out-and-back drive'), ('street_loop', 'A street'))
         ),
@@ -66,8 +66,9 @@ TABLES: dict[str, Table] = {
         Row('An hour of replay: keyframes', '{:.0f}', ('memory.keyframes',)),
         Row('— growth of the processes for each keyframe, cloud and descriptor included',
             '{:.0f} kB', ('memory.bytes_per_keyframe',), '', 1e-3),
-        Row('— growth without keyframes, an hour', '{:.1f} MB',
-            ('memory.without_keyframes_growth_mb_per_hour',), '0'),
+        Row('— without keyframes: size after 7 minutes / after 15', '{:.0f} / {:.0f} MB',
+            ('memory.without_keyframes.resident_at_half_mb',
+             'memory.without_keyframes.resident_at_end_mb'), 'no growth'),
     )),
     'lcdnet': Table('lcdnet', (
         Row('Average precision, protocol 1, same way / reverse: LCDNet', '{:.3f} / {:.3f}',

@@ -26,7 +26,7 @@ from lcd_loop_closure.report.summary import summary
 
 _EXAMPLES = """
 examples:
-  run_drive                                        a simulated town; see results/town_99_run0
+  run_drive                                        a simulated town; see results/town_36_run0
   run_drive town:3                                 1.5 km in another; town:3:1 on another day
   run_drive street:abrupt_u_turn                   a small made-up street and its routes
   run_drive drive.mcap --out results/monday        a rosbag2 (mcap, sqlite3) or rosbag1

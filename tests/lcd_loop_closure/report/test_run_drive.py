@@ -44,11 +44,11 @@ def test_without_arguments_a_town_is_driven(
     nodes: _Nodes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['--no-plots']) == 0
-    assert nodes.asked['drive'].name == 'town_99_run0'
+    assert nodes.asked['drive'].name == 'town_36_run0'
     out = capsys.readouterr().out
-    assert 'results/town_99_run0/report.html' in out
+    assert 'results/town_36_run0/report.html' in out
     assert '20 true, 2 false' in out and 'ATE' in out and 'truncated velodyne file' in out
-    assert Path('results/town_99_run0/report.html').is_file()
+    assert Path('results/town_36_run0/report.html').is_file()
 
 
 def test_options_reach_the_nodes(nodes: _Nodes, tmp_path: Path) -> None:
