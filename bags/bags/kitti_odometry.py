@@ -28,8 +28,9 @@ from bags.numbered_files import (
 )
 from bags.records import CameraImage, CameraModel, LidarScan, Mounting, Record
 from bags.sensor_stream import SensorStream, make_stream
-from bags.skips import Skips
+from bags.skips import Skips, UnreadableError
 from lcd_common import se3
+from lcd_common.cloud import PointCloud
 from lcd_common.errors import DataError
 from lcd_common.trajectory import Trajectory, read_poses
 
@@ -167,11 +168,21 @@ def _files_stream(
     def read(entry: int, stamp_ns: int) -> Record:
         if kind is LidarScan:
             cloud = read_float32_cloud(files[entry])
-            label = read_labels(labels / f'{entry:06d}.label', len(cloud), skips)
-            return LidarScan(stamp_ns, replace(cloud, label=label))
+            return LidarScan(stamp_ns, _labelled(cloud, labels / f'{entry:06d}.label', skips))
         return CameraImage(stamp_ns, read_image(files[entry]))
 
     return make_stream(kind, str(folder), times_ns[timed], timed, read, skips)
+
+
+def _labelled(cloud: PointCloud, file: Path, skips: Skips) -> PointCloud:
+    """Return a sweep with its labels, where it has some that fit."""
+    if not file.exists():
+        return cloud
+    try:
+        return replace(cloud, label=read_labels(file, len(cloud)))
+    except UnreadableError as error:
+        skips.add(error.cause, file, str(error))
+        return cloud
 
 
 def _read_truth(

@@ -50,19 +50,22 @@ def read_float32_cloud(path: Path) -> PointCloud:
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
-def read_labels(path: Path, points: int, skips: Skips) -> NDArray[np.uint16] | None:
-    """Read SemanticKITTI's labels [N] of a sweep, or return None where it has none.
+def read_labels(path: Path, points: int) -> NDArray[np.uint16]:
+    """Read SemanticKITTI's labels [N] of a sweep of so many points.
 
-    Labels that do not fit the sweep are counted and left out; the sweep stays.
+    Raises:
+        UnreadableError: the file is gone, or does not have 4 bytes a point.
     """
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        return None
+    except OSError as error:
+        raise UnreadableError('unreadable label file', f'{path}: {error.strerror}') from None
     if len(data) != 4 * points:
-        message = f'{path}: {len(data)} bytes for {points} points; labels have 4 bytes a point'
-        skips.add('labels that do not fit their scan', path, message)
-        return None
+        raise UnreadableError(
+            'labels that do not fit their scan',
+            f'{path}: {len(data)} bytes for {points} points; labels have 4 bytes a point: '
+            'give those of the same sweeps',
+        )
     return (np.frombuffer(data, '<u4') & 0xFFFF).astype(np.uint16)
 
 

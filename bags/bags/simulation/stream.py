@@ -194,7 +194,7 @@ class SweepStream:
         runs = rng.integers(settings.runs, size=len(poses))
         times_s = rng.uniform(0.0, 600.0, len(poses))
         T = np.stack([pose for pose, _ in poses])
-        clouds: list[tuple[torch.Tensor, torch.Tensor] | None] = [None] * len(poses)
+        clouds: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
         for run in np.unique(runs).tolist():
             at = np.flatnonzero(runs == run)
             caster = self._caster(held, run, model)
@@ -208,12 +208,10 @@ class SweepStream:
                     )
                     for k in at.tolist()
                 ]
-            for k, cloud in zip(at.tolist(), measured, strict=True):
-                clouds[k] = cloud
+            clouds.update(zip(at.tolist(), measured, strict=True))
         return [
-            StreamedSweep(*cloud, *pose, held.town.seed, int(run), sensor)
-            for cloud, pose, run in zip(clouds, poses, runs, strict=True)
-            if cloud is not None
+            StreamedSweep(*clouds[k], *pose, held.town.seed, int(runs[k]), sensor)
+            for k, pose in enumerate(poses)
         ]
 
     def _caster(self, held: _HeldTown, run: int, model: LidarModel) -> EmbreeCaster | LidarRaster:
@@ -282,7 +280,7 @@ def measured_sweeps(
 
     reflectivity = tensor(REFLECTIVITY)[hits.label, hits.material]
     R, t = tensor(T_world_lidar[:, :3, :3]), tensor(T_world_lidar[:, :3, 3])
-    finite = torch.where(torch.isfinite(hits.range_m), hits.range_m, 0.0 * hits.range_m.new_ones(1))
+    finite = torch.where(torch.isfinite(hits.range_m), hits.range_m, 0.0)
     along = (raster.directions.reshape(1, -1, 3) @ R.mT).view(*shape, 3)
     xyz_world = finite[..., None] * along + t[:, None, None]
     surfaces = Surfaces(

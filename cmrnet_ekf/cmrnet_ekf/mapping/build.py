@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from bags.input_arguments import add_input, add_span, drive_from
 from bags.inputs import span_ns
+from bags.numbered_files import read_labels
 from bags.records import Drive, LidarScan
 from cmrnet_ekf.mapping.map_builder import MapBuilder
 from cmrnet_ekf.mapping.settings import MapConfig
@@ -131,21 +132,14 @@ def drive_sweeps(
                 f'{drive.path}: nothing says where {scan.frame_id} sits; it has '
                 f'{", ".join(places) or "no mountings"}'
             )
-        moving = None
+        cloud = scan.cloud
         if labels:
-            moving = _moving(Path(labels) / f'{number:06d}.label', len(scan.cloud))
-        elif labels is not None:
-            moving = scan.cloud.moving
-            if moving is None:
-                raise DataError(f'{drive.path}: its points have no labels; leave --labels out')
-        yield Sweep(scan.cloud, T_map_base, places[scan.frame_id], moving)
-
-
-def _moving(file: Path, count: int) -> NDArray[np.bool_]:
-    labels = np.fromfile(file, np.uint32) & 0xFFFF
-    if len(labels) != count:
-        raise DataError(f'{file}: {len(labels)} labels for {count} points; give the same sweeps')
-    return np.asarray(labels >= 252)  # SemanticKITTI: 252 to 259 move
+            label = read_labels(Path(labels) / f'{number:06d}.label', len(cloud))
+            cloud = replace(cloud, label=label)
+        moving = None if labels is None else cloud.moving
+        if labels is not None and moving is None:
+            raise DataError(f'{drive.path}: its points have no labels; leave --labels out')
+        yield Sweep(cloud, T_map_base, places[scan.frame_id], moving)
 
 
 def _keyframes(path: Path) -> tuple[Iterator[Sweep], int]:

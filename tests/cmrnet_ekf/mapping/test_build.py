@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from bags.inputs import open_input
+from bags.numbered_files import read_labels
 from bags.records import LidarScan
 from cmrnet_ekf.mapping import build
 from cmrnet_ekf.mapping.tile_folder import TileFolder
@@ -73,7 +74,8 @@ def test_a_map_of_the_pose_graph_becomes_a_lidar_map(tmp_path):
 def test_semantickitti_labels_say_what_moves(tmp_path):
     labels = np.array([40, 252, 10, 259 | (7 << 16)], np.uint32)
     labels.tofile(tmp_path / '000000.label')
-    np.testing.assert_array_equal(build._moving(tmp_path / '000000.label', 4),
+    read = read_labels(tmp_path / '000000.label', 4)
+    np.testing.assert_array_equal(PointCloud(np.zeros((4, 3), np.float32), label=read).moving,
                                   [False, True, False, True])  # fmt: skip
 
 
