@@ -58,6 +58,7 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
     """Return every section by name: what it measures, and the function that does."""
     # Imported here: --help and --list need none of it.
     from benchmarks import (
+        lcdnet_ablations,
         lcdnet_drives,
         lcdnet_loops,
         lcdnet_real,
@@ -94,6 +95,10 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         'loops': (
             'loops that the nodes accept, LCDNet beside Scan Context',
             lcdnet_loops.evaluate,
+        ),
+        'ablations': (
+            'variants of the network, trained alike and briefly: Tables 3.8 and 3.9',
+            partial(lcdnet_ablations.ablations, steps=10 if quick else 120),
         ),
         'speed': ('times by stage, and how they grow', lcdnet_speed.evaluate),
     }

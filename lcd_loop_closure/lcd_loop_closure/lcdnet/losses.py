@@ -66,32 +66,35 @@ def triplet_loss(
 
 
 def separation_loss(
-    descriptors: Tensor, same: Tensor, different: Tensor, temperature: float
+    descriptors: Tensor, same: Tensor, away: Tensor, temperature: float, farther_m: float
 ) -> tuple[Tensor, float]:
-    """Return how badly pairs of one place stand out from all pairs with other places.
+    """Return how badly pairs of one place stand out from all pairs that lie farther apart.
 
     Not in the thesis: log(1 + sum_n exp((s_n - s_p) / t)) for each pair p of one place, over all
-    pairs n of its first sweep with other places. Every negative of a large batch counts by how much
-    it is alike.
+    sweeps n that lie farther from its first sweep than its second. Every negative of a large batch
+    counts by how much it is alike, and the nearest sweep of a street must be the most alike.
 
     Args:
         descriptors: [B x G], unit length.
         same: [B x B] bool, pairs that show one place.
-        different: [B x B] bool, pairs that show two; those that are neither do not count.
+        away: [B x B] how far apart, metres; NaN where a pair does not count.
         temperature: t.
+        farther_m: farther by so much, n counts.
 
     Returns:
         The mean loss, and the share of pairs of one place that are less alike than a negative.
     """
     similarity = descriptors @ descriptors.T
-    scaled = similarity / temperature
-    # Not minus infinity: of a row without a negative the sum would have no slope.
-    against = scaled.masked_fill(~different, -1e4).logsumexp(1)
-    loss = torch.nn.functional.softplus(against[:, None] - scaled)[same]
-    if not len(loss):
+    first, second = torch.nonzero(same, as_tuple=True)
+    if not len(first):
         return similarity.sum() * 0.0, 0.0
-    worst = similarity.detach().masked_fill(~different, -1.0).amax(1)
-    confused = (worst[:, None] > similarity.detach())[same]
+    pair = similarity[first, second]
+    different = away[first] > (away[first, second] + farther_m)[:, None]
+    # Not minus infinity: of a row without a negative the sum would have no slope.
+    against = (similarity[first] / temperature).masked_fill(~different, -1e4).logsumexp(1)
+    loss = torch.nn.functional.softplus(against - pair / temperature)
+    with torch.no_grad():
+        confused = similarity[first].masked_fill(~different, -1.0).amax(1) > pair
     return loss.mean(), float(confused.float().mean())
 
 

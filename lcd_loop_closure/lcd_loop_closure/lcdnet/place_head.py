@@ -34,8 +34,13 @@ class PlaceHeadConfig:
     sweeps: int = setting(16, 'sweeps of a neighbourhood', low=2)
     around: float = setting(50.0, 'how far its sweeps lie from its middle', unit='m', low=4.0)
     keypoints: int = setting(512, 'drawn anew of each sweep in each batch', low=16)
+    sector: float = setting(
+        0.0, 'greatest sector left out of a sweep, drawn anew', unit='deg', low=0.0, high=180.0
+    )
     same: float = setting(4.0, 'sweeps up to this far apart show one place', unit='m', low=0.1)
-    different: float = setting(4.5, 'sweeps farther apart show different places', unit='m', low=0.1)
+    farther: float = setting(
+        1.5, 'a sweep farther away by so much must be less alike', unit='m', low=0.1
+    )
     returned: float = setting(
         50.0, 'way between two sweeps that show a return to a place', unit='m', low=0.0
     )
@@ -57,14 +62,15 @@ def train_place_head(
     for step in range(s.steps):
         rng = np.random.default_rng([s.seed, step, 101])
         chosen = middles.draw(rng)
-        values, keypoints = _some_keypoints(features, chosen, s.keypoints, rng)
+        values, keypoints = _some_keypoints(features, chosen, s, rng)
         descriptors = network.describe(values.to(device), keypoints.to(device))
-        same, different = middles.relations(chosen)
+        same, away = middles.relations(chosen)
         loss, confused = separation_loss(
             descriptors,
             torch.from_numpy(same).to(device),
-            torch.from_numpy(different).to(device),
+            torch.from_numpy(away).to(device),
             s.temperature,
+            s.farther,
         )
         for group in optimizer.param_groups:
             group['lr'] = s.learning_rate * (0.505 + 0.495 * np.cos(np.pi * step / s.steps))
@@ -76,14 +82,23 @@ def train_place_head(
 
 
 def _some_keypoints(
-    features: PlaceFeatures, rows: NDArray[np.intp], number: int, rng: np.random.Generator
+    features: PlaceFeatures, rows: NDArray[np.intp], s: PlaceHeadConfig, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return features [B x number x D] and positions of as many keypoints of each sweep."""
+    """Return features [B x N x D] and positions of some keypoints of each sweep.
+
+    A sector of its own is left out of each sweep, which costs nothing here.
+    """
     chosen = torch.from_numpy(rows)
-    total = features.values.shape[1]
-    order = torch.from_numpy(rng.random((len(rows), total)).argsort(1)[:, :number])[..., None]
+    at = features.keypoints[chosen].float()
+    bearing = torch.atan2(at[..., 1], at[..., 0]).numpy()
+    middle = rng.uniform(-np.pi, np.pi, (len(rows), 1))
+    off = np.abs((bearing - middle + np.pi) % (2.0 * np.pi) - np.pi)
+    hidden = off < np.radians(s.sector) / 2.0 * rng.random((len(rows), 1))
+    order = (rng.random(hidden.shape) + hidden).argsort(1)[:, : s.keypoints, None]
     picked = [
-        torch.gather(whole[chosen], 1, order.expand(-1, -1, whole.shape[2])).float()
+        torch.gather(
+            whole[chosen], 1, torch.from_numpy(order).expand(-1, -1, whole.shape[2])
+        ).float()
         for whole in (features.values, features.keypoints)
     ]
     return picked[0], picked[1]
@@ -119,12 +134,18 @@ class Neighbourhoods:
             groups.append([middle, rng.choice(partners), *others])
         return np.unique(np.concatenate(groups)).astype(np.intp)
 
-    def relations(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which of the sweeps [B x B] are returns to one place, and which are different."""
-        town = self._town[rows]
+    def relations(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Return which of the sweeps [B x B] are returns to one place, and how far apart all are.
+
+        Sweeps of different towns are infinitely far apart; sweeps of one pass (less way apart than
+        a return) are NaN: a drive never asks for its latest sweeps.
+        """
         away = np.linalg.norm(self._position[rows][:, None] - self._position[rows], axis=2)
-        different = (away > self._settings.different) | (town[:, None] != town)
-        return self._same(rows, rows), different
+        path = np.abs(self._path_m[rows][:, None] - self._path_m[rows])
+        away[path <= self._settings.returned] = np.nan
+        town = self._town[rows]
+        away[town[:, None] != town] = np.inf
+        return self._same(rows, rows), away
 
     def _same(self, a: NDArray[np.intp], b: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return whether rows a are returns to the places of rows b [A x B]."""

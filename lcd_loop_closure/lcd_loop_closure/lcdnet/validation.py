@@ -30,6 +30,7 @@ class Validation:
             degrees: loops (up to 4 m), and pairs 4 to 15 m apart.
         fast_success: the same of loops by transport alone.
         loops_te_m: mean translation error of the loops that count as registered; None without any.
+        pose_te_m, pose_re_rad: mean errors of the pose head over all loops, right or not.
     """
 
     places: int
@@ -39,6 +40,8 @@ class Validation:
     far_success: float
     fast_success: float
     loops_te_m: float | None
+    pose_te_m: float
+    pose_re_rad: float
 
     @property
     def score(self) -> float:
@@ -97,6 +100,7 @@ def validate(
         float(right[:, 2].mean()),
         float(right[:, 0].mean()),
         float(te.mean()) if len(te) else None,
+        *errors[:, 0].mean(0).tolist(),
     )
 
 

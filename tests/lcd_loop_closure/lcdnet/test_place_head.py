@@ -12,7 +12,7 @@ from lcd_common import se3
 from lcd_common.cloud import PointCloud
 from lcd_common.errors import ConfigError, DataError
 from lcd_loop_closure.evaluation.sweep_store import SweepWriter
-from lcd_loop_closure.lcdnet import Lcdnet, checkpoint, train_place_head
+from lcd_loop_closure.lcdnet import Lcdnet, checkpoint, place_head, train_place_head
 from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig
 from lcd_loop_closure.lcdnet.losses import separation_loss
 from lcd_loop_closure.lcdnet.netvlad import with_ranges
@@ -71,28 +71,31 @@ def test_the_loss_is_its_formula():
     rng = np.random.default_rng(0)
     d = rng.normal(size=(9, 5))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    place = np.array([0, 0, 0, 1, 1, 2, 2, 3, 4])
-    same = (place[:, None] == place) & ~np.eye(9, dtype=bool)
-    different = np.abs(place[:, None] - place) > 1  # neighbours are neither
+    x = np.array([0.0, 1.0, 2.5, 7.0, 8.0, 20.0, 21.5, 50.0, np.nan])
+    away = np.abs(x[:, None] - x)
+    away[2, 3] = away[3, 2] = np.nan  # this pair does not count
+    same = (away < 4.0) & ~np.eye(9, dtype=bool)
     s, t, losses, confused = d @ d.T, 0.1, [], []
     for i, j in np.argwhere(same):
-        others = s[i][different[i]]
+        others = s[i][away[i] > away[i, j] + 1.5]
         losses.append(np.log1p(np.exp((others - s[i, j]) / t).sum()))
         confused.append(others.max() > s[i, j])
-    loss, share = separation_loss(*map(torch.from_numpy, (d, same, different)), t)
+    loss, share = separation_loss(*map(torch.from_numpy, (d, same, away)), t, 1.5)
+    assert len(losses) == 10
     assert float(loss) == pytest.approx(np.mean(losses), rel=1e-6)
     assert share == pytest.approx(np.mean(confused))
     none = torch.zeros(9, 9, dtype=torch.bool)
-    assert separation_loss(torch.from_numpy(d), none, none, t)[0] == 0.0
+    assert separation_loss(torch.from_numpy(d), none, torch.from_numpy(away), t, 1.5)[0] == 0.0
 
 
 def test_a_row_without_negatives_leaves_the_slope_finite():
     d = torch.nn.functional.normalize(torch.randn(4, 3), dim=1).requires_grad_()
     same = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]]).bool()
-    different = torch.zeros(4, 4, dtype=torch.bool)
-    different[0, 2] = different[2, 0] = True
-    separation_loss(d, same, different, 0.05)[0].backward()
-    assert bool(torch.isfinite(d.grad).all())
+    away = torch.full((4, 4), torch.nan)
+    away[same] = 1.0
+    away[0, 2] = away[2, 0] = 9.0
+    separation_loss(d, same, away, 0.05, 1.5)[0].backward()
+    assert bool(torch.isfinite(d.grad).all()) and bool((d.grad[:3] != 0).any())
 
 
 def test_rings_tell_distance_and_nothing_of_the_direction():
@@ -122,13 +125,13 @@ def test_features_are_those_that_the_network_sees():
 
 def test_neighbourhoods_have_loops_and_relations_are_true():
     _, made = features()
-    settings = PlaceHeadConfig(groups=3, sweeps=8, around=30.0, same=4.0, different=10.0)
+    settings = PlaceHeadConfig(groups=3, sweeps=8, around=30.0, same=4.0)
     groups = Neighbourhoods(made, settings)
     position, town = made.position.numpy(), made.town.numpy()
     for seed in range(20):
         rows = groups.draw(np.random.default_rng(seed))
         assert len(set(rows.tolist())) == len(rows) <= 24
-        same, different = groups.relations(rows)
+        same, apart = groups.relations(rows)
         assert same.any()
         for a, i in enumerate(rows):
             for b, j in enumerate(rows):
@@ -136,7 +139,10 @@ def test_neighbourhoods_have_loops_and_relations_are_true():
                 far = abs(float(made.path_m[i] - made.path_m[j])) > 50.0
                 own = town[i] == town[j]
                 assert same[a, b] == (own and away <= 4.0 and far)
-                assert different[a, b] == (not own or away > 10.0)
+                if not own:
+                    assert np.isinf(apart[a, b])
+                else:
+                    assert apart[a, b] == pytest.approx(away) if far else np.isnan(apart[a, b])
 
 
 def test_the_head_learns_and_nothing_else_changes(tmp_path):
@@ -154,6 +160,19 @@ def test_the_head_learns_and_nothing_else_changes(tmp_path):
     alone = drive_features(made, Drive(0), 0, None, chosen=np.arange(8))
     with pytest.raises(ConfigError, match='none of the drives returns'):
         Neighbourhoods(alone, settings)
+
+
+def test_a_sector_is_left_out_of_what_the_head_sees():
+    _, known = features(1)
+    rows = np.arange(6)
+    settings = PlaceHeadConfig(keypoints=24, sector=180.0)
+    for seed in range(5):
+        values, at = place_head._some_keypoints(known, rows, settings, np.random.default_rng(seed))
+        assert values.shape == (6, 24, 16) and at.shape == (6, 24, 3)
+        for row in range(6):
+            of = [known.keypoints[row].float().tolist().index(one) for one in at[row].tolist()]
+            assert len(set(of)) == 24
+            torch.testing.assert_close(values[row], known.values[row][of].float())
 
 
 def test_drives_are_judged_by_protocol_1():
