@@ -1,5 +1,7 @@
 """Gather the neighbours of keypoints: ball query."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -13,46 +15,53 @@ _AT_ONCE = 1 << 25  # distances held at a time on a GPU
 def ball_query(
     points: Tensor,
     centres: Tensor,
-    radius_m: float,
-    count: int,
+    balls: Sequence[tuple[float, int]],
     *,
     points_batch: Tensor,
     centres_batch: Tensor,
     generator: np.random.Generator | None = None,
     crowd: int = 4,
-) -> tuple[Tensor, Tensor]:
-    """Return neighbours within a ball around each centre (thesis equation 3).
+) -> list[tuple[Tensor, Tensor]]:
+    """Return neighbours within balls around each centre (thesis equation 3).
 
-    A ball may hold more than `count` points; those taken are spread over the `crowd * count`
+    A ball may hold more points than are asked for; those taken are spread over the `crowd * count`
     nearest: evenly by their rank, or drawn at random with a generator (thesis equation 2 samples).
+    All balls are searched at once: the nearest of the largest hold those of the others.
 
     Args:
         points: [M x 3] metres.
         centres: [N x 3] metres.
-        radius_m: of the ball.
-        count: neighbours to return.
+        balls: radius, metres, and count of neighbours to return, of each.
         points_batch, centres_batch: [M], [N] cloud of the batch.
         generator: of random choices.
         crowd: how far the choice reaches.
 
     Returns:
-        index [N x count] into points, and whether [N x count] it is a neighbour; the rest repeat
-        the nearest one, and all are point 0 and False where the ball is empty.
+        For each ball index [N x count] into points, and whether [N x count] it is a neighbour; the
+        rest repeat the nearest one, and all are point 0 and False where the ball is empty.
     """
-    wide = min(crowd * count, max(len(points), 1))
     if not len(points):
-        shape = (len(centres), count)
-        return (
-            torch.zeros(shape, dtype=torch.long, device=centres.device),
-            torch.zeros(shape, dtype=torch.bool, device=centres.device),
-        )
+        shapes = [(len(centres), count) for _, count in balls]
+        return [
+            (
+                torch.zeros(shape, dtype=torch.long, device=centres.device),
+                torch.zeros(shape, dtype=torch.bool, device=centres.device),
+            )
+            for shape in shapes
+        ]
     points, centres = points.detach().float(), centres.detach().float()
     search = _by_tree if centres.device.type == 'cpu' else _by_distances
-    index, found = search(points, centres, radius_m, wide, points_batch, centres_batch)
-    chosen = _spread(found, count, generator)
-    index = torch.gather(index, 1, chosen)
-    valid = torch.arange(count, device=found.device) < found.clamp(max=count)[:, None]
-    return torch.where(valid, index, index[:, :1]), valid
+    widest, most = max(radius for radius, _ in balls), max(count for _, count in balls)
+    wide = min(crowd * most, len(points))
+    index, distance = search(points, centres, widest, wide, points_batch, centres_batch)
+    found = []
+    for radius_m, count in balls:
+        inside = (distance <= radius_m).sum(1).clamp(max=crowd * count)
+        chosen = torch.gather(index, 1, _spread(inside, count, generator))
+        valid = torch.arange(count, device=inside.device) < inside.clamp(max=count)[:, None]
+        first = torch.where(valid[:, :1], chosen[:, :1], 0)
+        found.append((torch.where(valid, chosen, first), valid))
+    return found
 
 
 def _spread(found: Tensor, count: int, generator: np.random.Generator | None) -> Tensor:
@@ -91,9 +100,8 @@ def _by_tree(
         distance_upper_bound=radius_m,
         workers=torch.get_num_threads(),
     )
-    found = torch.from_numpy(np.isfinite(distance).sum(1))
     index = torch.from_numpy(np.where(np.isfinite(distance), index, 0))
-    return index, found
+    return index, torch.from_numpy(distance)
 
 
 def _by_distances(
@@ -105,7 +113,7 @@ def _by_distances(
     in_centres: Tensor,
 ) -> tuple[Tensor, Tensor]:
     index = torch.zeros((len(centres), count), dtype=torch.long, device=centres.device)
-    found = torch.zeros(len(centres), dtype=torch.long, device=centres.device)
+    found = torch.full((len(centres), count), torch.inf, device=centres.device)
     for cloud in torch.unique(in_centres).tolist():
         rows = torch.nonzero(in_points == cloud)[:, 0]
         if not len(rows):
@@ -116,6 +124,7 @@ def _by_distances(
                 centres[part], points[rows], compute_mode='donot_use_mm_for_euclid_dist'
             )
             nearest, at = torch.topk(distance, min(count, len(rows)), dim=1, largest=False)
-            index[part, : at.shape[1]] = rows[at]
-            found[part] = (nearest <= radius_m).sum(1)
+            inside = nearest <= radius_m
+            index[part, : at.shape[1]] = torch.where(inside, rows[at], 0)
+            found[part, : at.shape[1]] = torch.where(inside, nearest, torch.inf)
     return index, found

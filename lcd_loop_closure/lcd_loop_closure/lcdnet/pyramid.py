@@ -23,6 +23,13 @@ class Pyramid:
     bev: Tensor
 
 
+def fixed(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
+    """Return the scale and shift that a batch normalisation is once it is trained."""
+    assert norm.running_mean is not None and norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return scale, norm.bias - norm.running_mean * scale
+
+
 class _Normalised(nn.Module):
     """A convolution, batch normalisation and ReLU."""
 
@@ -32,8 +39,12 @@ class _Normalised(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=1e-3)
 
     def forward(self, tensor: SparseTensor) -> SparseTensor:
-        tensor = self.convolution(tensor)
-        return tensor.with_features(torch.relu(self.norm(tensor.features)))
+        if self.training:
+            tensor = self.convolution(tensor)
+            return tensor.with_features(torch.relu(self.norm(tensor.features)))
+        scale, shift = fixed(self.norm)
+        tensor = self.convolution(tensor, scale)
+        return tensor.with_features(torch.relu(tensor.features + shift))
 
 
 class VoxelPyramid(nn.Module):

@@ -1,5 +1,7 @@
 """Bring all feature maps onto keypoints: voxel set abstraction (thesis equations 2 to 6)."""
 
+from itertools import groupby
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -7,8 +9,10 @@ from torch.nn import functional
 
 from lcd_loop_closure.lcdnet.config import LcdnetConfig
 from lcd_loop_closure.lcdnet.grouping import ball_query
-from lcd_loop_closure.lcdnet.pyramid import Pyramid
+from lcd_loop_closure.lcdnet.pyramid import Pyramid, fixed
 from lcd_loop_closure.lcdnet.voxels import Clouds, Voxels
+
+_AT_ONCE = 256  # keypoints
 
 
 class BallAbstraction(nn.Module):
@@ -35,11 +39,23 @@ class BallAbstraction(nn.Module):
         at_source = self.of_feature(features) + self.of_offset(xyz / self.radius_m)
         at_keypoint = self.of_offset(keypoints / self.radius_m)
         (n, count), width = index.shape, at_source.shape[1]
-        hidden = at_source.index_select(0, index.reshape(-1)).view(n, count, width)
-        hidden = hidden - at_keypoint[:, None]
-        hidden = torch.relu(self.norm(hidden.view(-1, width)))
-        hidden = torch.relu(self.second_norm(self.second(hidden))).view(n, count, width)
-        pooled = hidden.amax(1)
+        if self.training:
+            hidden = at_source.index_select(0, index.reshape(-1)).view(n, count, width)
+            hidden = (hidden - at_keypoint[:, None]).view(-1, width)
+            hidden = self.second_norm(self.second(torch.relu(self.norm(hidden))))
+            pooled = torch.relu(hidden).view(n, count, width).amax(1)
+        else:
+            # The same with both normalisations, constants now, where there are fewest numbers.
+            scale, shift = fixed(self.norm)
+            at_source, at_keypoint = at_source * scale + shift, at_keypoint * scale
+            scale, shift = fixed(self.second_norm)
+            second, parts = self.second.weight * scale[:, None], []
+            # In parts that stay in the cache.
+            for near, at in zip(index.split(_AT_ONCE), at_keypoint.split(_AT_ONCE), strict=True):
+                hidden = at_source.index_select(0, near.reshape(-1)).view(-1, count, width)
+                hidden = functional.linear(torch.relu(hidden - at[:, None]), second)
+                parts.append(hidden.amax(1))
+            pooled = torch.relu(torch.cat(parts) + shift)
         return pooled * valid[:, :1]  # an empty ball says nothing
 
 
@@ -73,19 +89,23 @@ class VoxelSetAbstraction(nn.Module):
 
         With a generator, neighbours are drawn at random where a ball holds more than are taken.
         """
-        parts = []
-        for source, ball in zip(self.settings.group_source, self.balls, strict=True):
+        rows = list(zip(self.settings.group_source, self.balls, strict=True))
+        parts: list[Tensor] = []
+        for source, of_source in groupby(rows, key=lambda row: row[0]):
+            balls = [ball for _, ball in of_source]
             xyz, features, of = self._source(source, clouds, voxels, pyramid)
-            index, valid = ball_query(
+            neighbours = ball_query(
                 xyz,
                 keypoints,
-                ball.radius_m,
-                ball.count,
+                [(ball.radius_m, ball.count) for ball in balls],
                 points_batch=of,
                 centres_batch=batch,
                 generator=generator,
             )
-            parts.append(ball(xyz, features, keypoints, index, valid))
+            parts += [
+                ball(xyz, features, keypoints, *near)
+                for ball, near in zip(balls, neighbours, strict=True)
+            ]
         parts.append(self._from_above(pyramid.bev, keypoints, batch))
         return torch.relu(self.norm(self.merge(torch.cat(parts, 1))))
 

@@ -19,14 +19,27 @@ def _scene(seed=0):
 def test_neighbours_are_those_of_brute_force(way, monkeypatch):
     monkeypatch.setattr(grouping, '_by_tree', getattr(grouping, way))
     points, centres, of_points, of_centres = _scene()
-    index, valid = ball_query(
-        points, centres, 2.0, 40, points_batch=of_points, centres_batch=of_centres
-    )
+    balls = [(2.0, 40), (1.2, 30)]
+    found = ball_query(points, centres, balls, points_batch=of_points, centres_batch=of_centres)
     distance = torch.cdist(centres, points)
-    near = (distance <= 2.0) & (of_centres[:, None] == of_points[None])
-    for row in range(60):
-        assert set(index[row][valid[row]].tolist()) == set(torch.nonzero(near[row])[:, 0].tolist())
-    assert not valid.all() and valid.any()
+    for (radius, count), (index, valid) in zip(balls, found, strict=True):
+        near = (distance <= radius) & (of_centres[:, None] == of_points[None])
+        assert index.shape == valid.shape == (60, count)
+        for row in range(60):
+            inside = set(torch.nonzero(near[row])[:, 0].tolist())
+            assert set(index[row][valid[row]].tolist()) == inside
+        assert not valid.all() and valid.any()
+
+
+def test_balls_searched_at_once_are_those_searched_alone():
+    points, centres, of_points, of_centres = _scene()
+    balls = [(3.0, 4), (6.0, 8), (1.0, 8)]
+    whole = ball_query(points, centres, balls, points_batch=of_points, centres_batch=of_centres)
+    for ball, (index, valid) in zip(balls, whole, strict=True):
+        alone = ball_query(
+            points, centres, [ball], points_batch=of_points, centres_batch=of_centres
+        )[0]
+        assert torch.equal(index, alone[0]) and torch.equal(valid, alone[1])
 
 
 def test_crowded_balls_are_sampled_over_their_whole_width():
@@ -36,8 +49,8 @@ def test_crowded_balls_are_sampled_over_their_whole_width():
     centre = torch.zeros(1, 3)
     inside = torch.sort(points.norm(dim=1)).values[:64]
     for generator in (None, np.random.default_rng(0)):
-        index, valid = ball_query(
-            points, centre, 5.0, 16, points_batch=every, centres_batch=one, generator=generator
+        [(index, valid)] = ball_query(
+            points, centre, [(5.0, 16)], points_batch=every, centres_batch=one, generator=generator
         )
         distance = points[index[0]].norm(dim=1)
         assert bool(valid.all()) and len(set(index[0].tolist())) == 16
@@ -48,9 +61,10 @@ def test_crowded_balls_are_sampled_over_their_whole_width():
 def test_an_empty_ball_and_an_empty_cloud_say_so():
     points, centres, of_points, of_centres = _scene()
     far = centres + 1000.0
-    _, valid = ball_query(points, far, 1.0, 4, points_batch=of_points, centres_batch=of_centres)
+    ball = [(1.0, 4)]
+    [(_, valid)] = ball_query(points, far, ball, points_batch=of_points, centres_batch=of_centres)
     assert not valid.any()
-    index, valid = ball_query(
-        points[:0], centres, 1.0, 4, points_batch=of_points[:0], centres_batch=of_centres
+    [(index, valid)] = ball_query(
+        points[:0], centres, ball, points_batch=of_points[:0], centres_batch=of_centres
     )
     assert index.shape == (60, 4) and not valid.any()
