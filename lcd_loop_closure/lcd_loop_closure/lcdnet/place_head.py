@@ -29,13 +29,13 @@ from lcd_loop_closure.revisits import RevisitConfig
 class PlaceHeadConfig:
     """How the place head is trained on its own."""
 
-    steps: int = setting(600, 'batches', low=1)
-    groups: int = setting(6, 'neighbourhoods of a batch', low=1)
+    steps: int = setting(700, 'batches', low=1)
+    groups: int = setting(14, 'neighbourhoods of a batch', low=1)
     sweeps: int = setting(16, 'sweeps of a neighbourhood', low=2)
-    around: float = setting(50.0, 'how far its sweeps lie from its middle', unit='m', low=4.0)
+    around: float = setting(20.0, 'how far its sweeps lie from its middle', unit='m', low=4.0)
     keypoints: int = setting(512, 'drawn anew of each sweep in each batch', low=16)
     sector: float = setting(
-        0.0, 'greatest sector left out of a sweep, drawn anew', unit='deg', low=0.0, high=180.0
+        60.0, 'greatest sector left out of a sweep, drawn anew', unit='deg', low=0.0, high=180.0
     )
     same: float = setting(4.0, 'sweeps up to this far apart show one place', unit='m', low=0.1)
     farther: float = setting(
