@@ -85,14 +85,31 @@ TABLES: dict[str, Table] = {
         *(
             Row(f'— {name}', '{:.3f} / {:.3f}',
                 (f'ap.protocol2.same_way.{key}', f'ap.protocol2.reverse.{key}'), 'below LCDNet')
-            for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'))
+            for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'),
+                              ('m2dp', 'M2DP'))
         ),
         *(
-            Row(f'Registered within 2 m and 5°, {band.replace("_", "-")} m apart: '
-                'LCDNet / KISS-Matcher / FPFH + RANSAC', '{:.1f} / {:.1f} / {:.1f} %',
-                tuple(f'registration.{band}.success.{method}'
-                      for method in ('lcdnet', 'kiss_matcher', 'fpfh_ransac')), asked, 100)
+            Row(f'Protocol 1, town 200, {what}, same way / reverse: LCDNet (M2DP, Scan Context)',
+                '{:.3f} / {:.3f} ({:.3f} / {:.3f}, {:.3f} / {:.3f})',
+                tuple(f'{key}.protocol1.{kind}.{method}'
+                      for method in ('lcdnet', 'm2dp', 'scan_context')
+                      for kind in ('same_way', 'reverse')), asked)
+            for key, what, asked in (
+                ('ap_sector_45', 'sectors of 45° removed', ''),
+                ('ap_sector_90', 'sectors of 90° removed', '≥ 0.70'),
+                ('ap_unseen_beams32', 'a sensor unseen in training', ''),
+            )
+        ),
+        *(
+            row
             for band, asked in (('0_4', '≥ 99.5 %'), ('4_10', ''), ('10_15', '≥ 90 %'))
+            for row in (
+                Row(f'Registered within 2 m and 5°, {band.replace("_", "-")} m apart: LCDNet',
+                    '{:.1f} %', (f'registration.{band}.success.lcdnet',), asked, 100),
+                Row('— KISS-Matcher / FPFH + RANSAC', '{:.1f} / {:.1f} %',
+                    (f'registration.{band}.success.kiss_matcher',
+                     f'registration.{band}.success.fpfh_ransac'), '', 100),
+            )
         ),
         Row('Real pair KITTI 00 52 / 4501, worst of 20 yaws', '{:.2f} m, {:.2f}°',
             ('real.kitti_00.pair_translation_error_m', 'real.kitti_00.pair_rotation_error_deg'),
