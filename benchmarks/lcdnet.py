@@ -72,13 +72,17 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
             'average precision on test towns, by both protocols, beside all baselines',
             partial(lcdnet_drives.detection, towns=towns),
         ),
+        'map_closures': (
+            'the same of MapClosures on the first town, which takes about an hour a drive',
+            partial(lcdnet_drives.map_closures, length_m=400.0 if quick else None),
+        ),
         'changed': (
             'a repeated run with other traffic, and a sensor that training did not see',
             lcdnet_drives.changed,
         ),
         'sectors': (
-            'the same with sectors of the view removed',
-            partial(lcdnet_drives.sectors, towns=towns),
+            'the same on the first town with sectors of the view removed',
+            lcdnet_drives.sectors,
         ),
         'registration': (
             'success and errors by distance, beside all baselines',
@@ -111,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _placed(figures: dict[str, Any], section: str, new: dict[str, Any]) -> Mapping[str, Any]:
     """Put a section's figures at the top, by their names; what a later run adds stays beside."""
-    if section in ('detection', 'real'):
+    if section in ('detection', 'map_closures', 'real'):
         return {**figures, **{k: _joined(figures.get(k, {}), v) for k, v in new.items()}}
     return {**figures, **new}
 

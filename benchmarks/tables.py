@@ -78,7 +78,7 @@ TABLES: dict[str, Table] = {
                 (f'ap.protocol1.same_way.{key}', f'ap.protocol1.reverse.{key}'), 'below LCDNet')
             for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'),
                               ('isc', 'Intensity Scan Context'), ('m2dp', 'M2DP'),
-                              ('map_closures', 'MapClosures'))
+                              ('map_closures', 'MapClosures (town 200)'))
         ),
         Row('Protocol 2, same way / reverse: LCDNet', '{:.3f} / {:.3f}',
             ('ap.protocol2.same_way.lcdnet', 'ap.protocol2.reverse.lcdnet'), 'above all'),

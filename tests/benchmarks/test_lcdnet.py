@@ -54,6 +54,27 @@ def test_a_later_run_of_a_section_keeps_what_others_wrote():
     assert third['keyframe_bytes'] == 7 and third['ap'] == second['ap']
 
 
+def test_map_closures_is_judged_by_class_beside_the_others(judged, monkeypatch, tmp_path):
+    asked = []
+
+    def curve(work, sweeps, reverse, kind):
+        asked.append((sweeps, kind, int(reverse.sum())))
+        return judged.detection.protocol_1[kind]
+
+    monkeypatch.setattr(lcdnet_drives, 'rendered', lambda work, kind, seed, length_m: seed)
+    monkeypatch.setattr(lcdnet_drives, 'judge_map_closures', curve)
+    monkeypatch.setattr(
+        lcdnet_drives, 'study_detection', lambda *_, **__: {'whole': {'scan_context': judged}}
+    )
+    figures = lcdnet_drives.map_closures(tmp_path)
+    reverse = int(judged.detection.reverse.sum())
+    assert asked == [(200, 'same_way', reverse), (200, 'reverse', reverse)] and reverse > 0
+    before = {'ap': {'protocol1': {'reverse': {'m2dp': 0.5}}}}
+    placed = lcdnet._placed(before, 'map_closures', figures)
+    expected = judged.detection.protocol_1['reverse'].average_precision
+    assert placed['ap']['protocol1']['reverse'] == {'m2dp': 0.5, 'map_closures': expected}
+
+
 def test_every_section_is_listed(capsys):
     assert lcdnet.main(['--list']) == 0
     shown = capsys.readouterr().out
