@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.lcdnet_tables import LCDNET_TABLES
 from benchmarks.result_table import Row, Table
 from benchmarks.town_tables import TOWN_TABLES
 from lcd_common.command_line import run
@@ -23,6 +24,7 @@ _BLOCK = re.compile(r'(<!-- table:([\w-]+) -->\n)(.*?)(<!-- end -->)', re.DOTALL
 
 TABLES: dict[str, Table] = {
     **TOWN_TABLES,
+    **LCDNET_TABLES,
     'drive': Table('drive', (
         Row('Real out-and-back drive, live at 1x: scans that odometry lost', '{:.0f}',
             ('out_and_back.odometry_lost',), '0'),
