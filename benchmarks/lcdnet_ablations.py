@@ -29,22 +29,19 @@ VARIANTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 FIGURES = ('average_precision', 'loops_success', 'pose_te_m', 'pose_re_deg')
 
 
-def ablations(
-    work: Path, steps: int = 120, towns: int = 12, variants: dict[str, Any] | None = None
-) -> dict[str, Any]:
+def ablations(work: Path, steps: int = 120, towns: int = 12) -> dict[str, Any]:
     """Return the validation figures of each variant after as many steps, all else alike.
 
     Args:
         work: folder of places and trainings; a training that ended is not done again.
         steps: budget of each training.
         towns: training towns; validation towns are four.
-        variants: to train; None: all of `VARIANTS`.
 
     Raises:
         LocalizationError: a training failed.
     """
     found: dict[str, Any] = {}
-    for name, (network, training) in (variants or VARIANTS).items():
+    for name, (network, training) in VARIANTS.items():
         out = work / 'ablations' / f'{name}_{steps}'
         rows = out / 'validation.jsonl'
         if not rows.is_file():

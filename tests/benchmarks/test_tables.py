@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import tables
+from benchmarks import lcdnet_ablations, tables
 
 README = 'Results\n\n<!-- table:drive -->\nold\n<!-- end -->\nafter\n'
 
@@ -159,3 +159,9 @@ def test_every_key_that_the_issue_names_is_shown() -> None:
         'graph_update_p99_ms_at_10000',
         'memory.bytes_per_keyframe',
     } <= keys
+
+
+def test_every_variant_that_is_trained_has_its_row() -> None:
+    rows = tables.TABLES['lcdnet_ablations'].rows
+    trained = {f'ablations.{name}.average_precision' for name in lcdnet_ablations.VARIANTS}
+    assert {row.cells[0].keys[0] for row in rows} == trained

@@ -140,20 +140,19 @@ class Neighbourhoods:
         Sweeps of different towns are infinitely far apart; sweeps of one pass (less way apart than
         a return) are NaN: a drive never asks for its latest sweeps.
         """
-        away = np.linalg.norm(self._position[rows][:, None] - self._position[rows], axis=2)
-        path = np.abs(self._path_m[rows][:, None] - self._path_m[rows])
-        away[path <= self._settings.returned] = np.nan
-        town = self._town[rows]
-        away[town[:, None] != town] = np.inf
-        return self._same(rows, rows), away
+        away = self._away(rows, rows)
+        return away <= self._settings.same, away
 
     def _same(self, a: NDArray[np.intp], b: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return whether rows a are returns to the places of rows b [A x B]."""
-        s = self._settings
+        return self._away(a, b) <= self._settings.same
+
+    def _away(self, a: NDArray[np.intp], b: NDArray[np.intp]) -> NDArray[np.float64]:
         away = np.linalg.norm(self._position[a][:, None] - self._position[b], axis=2)
         path = np.abs(self._path_m[a][:, None] - self._path_m[b])
-        own = self._town[a][:, None] == self._town[b]
-        return np.asarray(own & (away <= s.same) & (path > s.returned))
+        away[path <= self._settings.returned] = np.nan
+        away[self._town[a][:, None] != self._town[b]] = np.inf
+        return np.asarray(away)
 
 
 @torch.inference_mode()

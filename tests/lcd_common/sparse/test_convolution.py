@@ -45,6 +45,19 @@ def check_gradients(sparse: Tensor, dense: Tensor, inputs: list[Tensor]) -> None
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize('kernel', [1, 3, (1, 3, 5)])
+@pytest.mark.parametrize('strided', [False, True])
+def test_without_gradients_it_is_the_same_convolution(kernel: object, strided: bool) -> None:
+    tensor = voxels()
+    layer = (SparseConv3d if strided else SubmanifoldConv3d)(5, 7, kernel).double()
+    scale = torch.linspace(-1.0, 2.0, 7, dtype=torch.float64)
+    with_gradients = layer(tensor).features * scale
+    with torch.no_grad():
+        without = layer(tensor, scale).features
+    assert with_gradients.requires_grad and not without.requires_grad
+    torch.testing.assert_close(without, with_gradients.detach(), rtol=1e-10, atol=1e-10)
+
+
 @pytest.mark.parametrize('kernel', [1, 3, 5, (3, 1, 1), (1, 3, 5)])
 def test_submanifold_is_dense_convolution_on_the_voxels(kernel: object) -> None:
     tensor = voxels()

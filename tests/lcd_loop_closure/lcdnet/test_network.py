@@ -52,6 +52,22 @@ def test_a_batch_gives_what_its_clouds_give_alone():
 
 
 @torch.no_grad()
+def test_normalisations_that_are_constants_are_those_of_the_layers():
+    rng = torch.Generator().manual_seed(0)
+    network = _network()
+    for norm in (m for m in network.modules() if isinstance(m, torch.nn.BatchNorm1d)):
+        for values in (norm.weight.data, norm.bias.data, norm.running_mean, norm.running_var):
+            values.copy_(torch.rand(values.shape, generator=rng) + 0.5)
+    clouds = Clouds.of([_cloud(0)])
+    with torch.no_grad():
+        folded = network(clouds).features
+        # Batch normalisation alone at rest: the layers themselves take the way of training.
+        for module in network.modules():
+            module.training = not isinstance(module, torch.nn.BatchNorm1d)
+        layer_by_layer = network(clouds).features
+    torch.testing.assert_close(folded, layer_by_layer, rtol=1e-4, atol=1e-5)
+
+
 def test_keypoints_are_structure_and_descriptors_have_unit_length():
     network = _network(replace(TINY, keypoint_height=0.5))
     found = network(Clouds.of([_cloud(4)]), keypoints=30)
