@@ -44,7 +44,14 @@ class PoseHead(nn.Module):
                 self.correlated.weight *= 0.1
 
     def forward(self, features: Tensor) -> Output:
-        """Return the output of features [B x F]; in training mode, or while sampling, of a draw."""
+        """Return the output of features [B x F]; in training mode, or while sampling, of a draw.
+
+        Computed in full precision even under autocast: distributions end where half rounds to.
+        """
+        with torch.autocast(features.device.type, enabled=False):
+            return self._output(features.float())
+
+    def _output(self, features: Tensor) -> Output:
         x = functional.leaky_relu(self.shared(self.dropout(features)), _SLOPE)
         near = [
             functional.leaky_relu(branch[0](self.dropout(x)), _SLOPE)

@@ -35,6 +35,7 @@ class TrainingConfig:
     )
     augment: bool = setting(True, 'mirror and vary colours')
     clip: float = setting(10.0, 'largest norm of the gradient; 0: none', low=0.0)
+    half: bool = setting(False, 'mixed precision (bfloat16); the heads stay in full')
     checkpoint_every: int = setting(500, 'batches between checkpoints', low=1)
     seed: int = setting(0, 'of weights and of everything drawn', low=0)
 
@@ -154,7 +155,8 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group['lr'] = self._learning_rate()
         self.network.train()
-        output = self.network(batch.image, batch.lidar)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=s.half):
+            output = self.network(batch.image, batch.lidar)
         evidence = self._loss.evidence_scale(self.step / s.steps)
         losses = pose_losses(output, batch.target, self._loss, evidence)
         self.optimizer.zero_grad(set_to_none=True)

@@ -11,7 +11,7 @@ NETWORKS: dict[str, tuple[CmrnetConfig, TrainingConfig]] = {
     # A small network learns faster, and two CPU cores do not wait for 190,000 batches.
     'compact': (
         COMPACT,
-        TrainingConfig(steps=8000, batch=8, learning_rate=5e-4, schedule='cosine'),
+        TrainingConfig(steps=8000, batch=8, learning_rate=5e-4, schedule='cosine', half=True),
     ),
 }
 VARIANTS = {

@@ -57,6 +57,18 @@ def test_each_head_says_something_valid(head, kind):
         assert (torch.diagonal(L, dim1=1, dim2=2) > 0).all()
 
 
+@pytest.mark.parametrize('head', ['quaternion', 'evidential', 'covariance'])
+def test_heads_answer_in_full_precision_under_autocast(head):
+    torch.manual_seed(0)
+    network = Cmrnet(replace(SMALL, head=head))
+    features = torch.randn(3, network.head.shared.in_features)
+    expected = network.head(features)
+    with torch.autocast('cpu', torch.bfloat16):
+        found = network.head(features)
+    for one, other in zip(vars(found).values(), vars(expected).values(), strict=True):
+        assert torch.equal(one, other)
+
+
 def test_all_weights_learn_from_both_images():
     torch.manual_seed(1)
     network = Cmrnet(SMALL)

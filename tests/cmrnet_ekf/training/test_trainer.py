@@ -66,3 +66,15 @@ def test_a_loss_that_is_no_number_stops_the_training(tmp_path, samples):
         broken.network.head.shared.weight[0] = float('nan')
     with pytest.raises(TrainingFailedError, match='step 1 '):
         list(broken.run())
+
+
+def test_mixed_precision_learns_what_full_precision_does(tmp_path, samples):
+    settings = TrainingConfig(steps=40, batch=8, learning_rate=5e-3, augment=False)
+    shape = replace(SMALL, head='evidential')
+    ends = {}
+    for half in (False, True):
+        chosen = replace(settings, half=half)
+        records = list(trainer(tmp_path / str(half), samples, chosen, shape).run())
+        ends[half] = np.mean([r.translation for r in records[-10:]])
+    assert ends[True] != ends[False]
+    assert ends[True] == pytest.approx(ends[False], rel=0.25)
