@@ -73,8 +73,8 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
             partial(lcdnet_drives.detection, towns=towns),
         ),
         'map_closures': (
-            'the same of MapClosures on the first town, which takes about an hour a drive',
-            partial(lcdnet_drives.map_closures, length_m=400.0 if quick else None),
+            'the same of MapClosures on shorter drives, with LCDNet and Scan Context beside it',
+            partial(lcdnet_drives.map_closures, length_m=400.0 if quick else 1200.0),
         ),
         'changed': (
             'a repeated run with other traffic, and a sensor that training did not see',

@@ -79,9 +79,13 @@ TABLES: dict[str, Table] = {
             Row(f'— {name}', '{:.3f} / {:.3f}',
                 (f'ap.protocol1.same_way.{key}', f'ap.protocol1.reverse.{key}'), 'below LCDNet')
             for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'),
-                              ('isc', 'Intensity Scan Context'), ('m2dp', 'M2DP'),
-                              ('map_closures', 'MapClosures (town 200)'))
+                              ('isc', 'Intensity Scan Context'), ('m2dp', 'M2DP'))
         ),
+        Row('— MapClosures on 1.2 km of town 200 (LCDNet, Scan Context on the same)',
+            '{:.3f} / {:.3f} ({:.3f} / {:.3f}, {:.3f} / {:.3f})',
+            tuple(f'map_closures_drives.{kind}.{method}'
+                  for method in ('map_closures', 'lcdnet', 'scan_context')
+                  for kind in ('same_way', 'reverse')), 'below LCDNet'),
         Row('Protocol 2, same way / reverse: LCDNet', '{:.3f} / {:.3f}',
             ('ap.protocol2.same_way.lcdnet', 'ap.protocol2.reverse.lcdnet'), 'above all'),
         *(

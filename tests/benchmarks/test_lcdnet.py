@@ -64,7 +64,9 @@ def test_map_closures_is_judged_by_class_beside_the_others(judged, monkeypatch, 
     monkeypatch.setattr(lcdnet_drives, 'rendered', lambda work, kind, seed, length_m: seed)
     monkeypatch.setattr(lcdnet_drives, 'judge_map_closures', curve)
     monkeypatch.setattr(
-        lcdnet_drives, 'study_detection', lambda *_, **__: {'whole': {'scan_context': judged}}
+        lcdnet_drives,
+        'study_detection',
+        lambda *_, **__: {'whole': {'lcdnet': judged, 'scan_context': judged}},
     )
     figures = lcdnet_drives.map_closures(tmp_path)
     reverse = int(judged.detection.reverse.sum())
@@ -73,6 +75,8 @@ def test_map_closures_is_judged_by_class_beside_the_others(judged, monkeypatch, 
     placed = lcdnet._placed(before, 'map_closures', figures)
     expected = judged.detection.protocol_1['reverse'].average_precision
     assert placed['ap']['protocol1']['reverse'] == {'m2dp': 0.5, 'map_closures': expected}
+    beside = placed['map_closures_drives']['reverse']
+    assert beside == dict.fromkeys(('map_closures', 'lcdnet', 'scan_context'), expected)
 
 
 def test_every_section_is_listed(capsys):
