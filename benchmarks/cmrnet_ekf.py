@@ -68,7 +68,7 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         ekf_kitti,
     )
 
-    runs = 10 if quick else 50
+    runs = 10 if quick else 200
     return {
         'localization': (
             'errors of CMRNet and its uncertain variants on test towns, single pass and in stages',
