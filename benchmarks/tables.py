@@ -120,6 +120,17 @@ TABLES: dict[str, Table] = {
         Row('Real pair KITTI 00 52 / 4501, worst of 20 yaws', '{:.2f} m, {:.2f}°',
             ('real.kitti_00.pair_translation_error_m', 'real.kitti_00.pair_rotation_error_deg'),
             '≤ 0.35 m, 0.6°'),
+        Row('Real pairs of different places, rejected', '{:,.0f} of {:,.0f}',
+            ('real.kitti_00.negatives_rejected', 'real.kitti_00.negatives'), 'all'),
+        Row('Karlsruhe out and back, average precision: LCDNet / Scan Context / M2DP',
+            '{:.3f} / {:.3f} / {:.3f}',
+            tuple(f'real.out_and_back.ap_protocol1.{method}'
+                  for method in ('lcdnet', 'scan_context', 'm2dp')), 'LCDNet the best'),
+        Row('Loops that the nodes close there, right / wrong: LCDNet (Scan Context)',
+            '{:.0f} / {:.0f} ({:.0f} / {:.0f})',
+            tuple(f'loops_of_the_nodes.out_and_back.{method}.{kind}'
+                  for method in ('lcdnet', 'scan_context') for kind in ('true', 'false')),
+            'as many, none wrong'),
         Row('Descriptor and features of a sweep, two cores', '{:.0f} ms',
             ('descriptor_ms.compact_cpu',), '≤ 150 ms'),
         Row('— the full-size network', '{:.0f} ms', ('descriptor_ms.full_cpu',), '≤ 600 ms'),

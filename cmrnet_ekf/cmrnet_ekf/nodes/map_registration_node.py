@@ -1,7 +1,7 @@
 """Refine where the vehicle is by a camera image and a LiDAR map, and say how surely.
 
     ros2 run cmrnet_ekf map_registration --ros-args --params-file config/map_registration.yaml
-    ros2 run cmrnet_ekf map_registration --ros-args -p map:=town -p weights:=der.safetensors
+    ros2 run cmrnet_ekf map_registration --ros-args -p map:=town
 
 Subscribes  camera/image (sensor_msgs/Image), camera/camera_info (sensor_msgs/CameraInfo),
             odometry/filtered (nav_msgs/Odometry: the predicted pose in the map, from ekf),
@@ -33,7 +33,7 @@ from cmrnet_ekf.nodes.camera_messages import (
     image_message,
 )
 from cmrnet_ekf.overlay import overlay
-from cmrnet_ekf.predictors import Predictor
+from cmrnet_ekf.predictors import SHIPPED, Predictor
 from cmrnet_ekf.rejection import traces
 from lcd_common import se3
 from lcd_common.device import choose_device
@@ -58,7 +58,8 @@ class MapRegistrationConfig:
     weights: str = setting(
         '',
         'networks that refine one after the other, separated by commas: .safetensors files of '
-        'train_cmrnet, or folders of them as ensembles',
+        'train_cmrnet, or folders of them as ensembles; empty: the one that ships (DER, trained on '
+        'simulated towns only)',
     )
     samples: int = setting(30, 'draws of MC dropout', low=2)
     base_frame: str = setting('base_link', 'frame of the vehicle')
@@ -104,12 +105,13 @@ class MapRegistrationNode(Node):
         self.config = declare_config(self, MapRegistrationConfig)
         local_map = declare_config(self, LocalMapConfig, 'local_map')
         c = self.config
-        weights = [path.strip() for path in c.weights.split(',')]
-        if not c.map or not all(weights):
+        weights = [path.strip() for path in (c.weights or str(SHIPPED)).split(',')]
+        if not c.map:
             raise ConfigError(
-                'map_registration needs the parameters map (build_lidar_map makes one) and weights '
-                '(train_cmrnet makes them)'
+                'map_registration needs the parameter map, a folder: build_lidar_map makes one'
             )
+        if not all(weights):
+            raise ConfigError(f'weights: expected files between the commas, got {c.weights!r}')
         self._map = LocalMap(Path(c.map), local_map)
         device = choose_device(c.device)
         self._stages = [Predictor.load(Path(path), device, c.samples) for path in weights]
