@@ -29,7 +29,7 @@ VARIANTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 FIGURES = ('average_precision', 'loops_success', 'pose_te_m', 'pose_re_deg')
 
 
-def ablations(work: Path, steps: int = 120, towns: int = 12) -> dict[str, Any]:
+def ablations(work: Path, steps: int = 80, towns: int = 12) -> dict[str, Any]:
     """Return the validation figures of each variant after as many steps, all else alike.
 
     Args:

@@ -89,7 +89,7 @@ def detection(work: Path, towns: int = 3) -> dict[str, Any]:
     return figures
 
 
-def map_closures(work: Path, length_m: float = 1200.0) -> dict[str, Any]:
+def map_closures(work: Path, length_m: float = 800.0) -> dict[str, Any]:
     """Return MapClosures' average precision by class, protocol 1, and that of others beside it.
 
     Its time grows with the square of the way, to an hour for a drive as long as the others'; so it

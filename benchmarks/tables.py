@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.lcdnet_tables import LCDNET_TABLES
+from benchmarks.localization_tables import LOCALIZATION_TABLES
 from benchmarks.result_table import Row, Table
 from benchmarks.town_tables import TOWN_TABLES
 from lcd_common.command_line import run
@@ -25,6 +26,7 @@ _BLOCK = re.compile(r'(<!-- table:([\w-]+) -->\n)(.*?)(<!-- end -->)', re.DOTALL
 TABLES: dict[str, Table] = {
     **TOWN_TABLES,
     **LCDNET_TABLES,
+    **LOCALIZATION_TABLES,
     'drive': Table('drive', (
         Row('Real out-and-back drive, live at 1x: scans that odometry lost', '{:.0f}',
             ('out_and_back.odometry_lost',), '0'),
@@ -81,7 +83,7 @@ TABLES: dict[str, Table] = {
             for key, name in (('lidar_iris', 'LiDAR-Iris'), ('scan_context', 'Scan Context'),
                               ('isc', 'Intensity Scan Context'), ('m2dp', 'M2DP'))
         ),
-        Row('— MapClosures on 1.2 km of town 200 (LCDNet, Scan Context on the same)',
+        Row('— MapClosures on 0.8 km of town 200 (LCDNet, Scan Context on the same)',
             '{:.3f} / {:.3f} ({:.3f} / {:.3f}, {:.3f} / {:.3f})',
             tuple(f'map_closures_drives.{kind}.{method}'
                   for method in ('map_closures', 'lcdnet', 'scan_context')

@@ -1,0 +1,110 @@
+"""What the tables about place recognition, CMRNet and the EKF show of their result files."""
+
+from benchmarks.result_table import Cell, Row, Table, WideRow
+
+_SETS = ('town', 'town_far', 'sensor', 'aliased')
+_WAYS = {'rough': 'the guesses', 'cmrnet': 'CMRNet', 'mcd': 'MC dropout', 'de': 'deep ensemble',
+         'der': 'evidential regression'}  # fmt: skip
+_UNCERTAIN = ('mcd', 'de', 'der')
+_TRACKED = {
+    'motion': 'motion model alone',
+    'unfiltered': 'CMRNet without a filter',
+    'mcd': 'EKF, MC dropout',
+    'de': 'EKF, deep ensemble',
+    'der': 'EKF, evidential regression',
+}
+
+
+def _localized(way: str, what: str) -> WideRow:
+    errors = f'localization.{way}'
+    cells: tuple[Cell | str, ...] = (
+        Cell('{:.2f} / {:.2f} m', (f'{errors}.t_median_m', f'{errors}.t_mean_m')),
+        Cell('{:.2f}°', (f'{errors}.r_median_deg',)),
+        Cell('{:.1f} %', (f'{errors}.failures_1m',), 100),
+    )
+    if way not in _UNCERTAIN:
+        return WideRow(what, (*cells, '', ''))
+    calibrated = tuple(f'calibration.{way}.{axis}' for axis in ('x', 'y', 'yaw'))
+    return WideRow(
+        what,
+        (
+            *cells,
+            Cell('{:.3f} / {:.3f} / {:.3f}', calibrated),
+            Cell('{:.2f} m', (f'rejection.{way}.t_mean_m',)),
+        ),
+    )
+
+
+LOCALIZATION_TABLES = {
+    'place_recognition': Table('place_recognition', (
+        *(
+            Row(f'False matches, {share} % promised', '{:.1f} % ({:.1f} to {:.1f})',
+                tuple(f'guarantee.target_{share:02d}.{key}' for key in ('observed', 'low', 'high')),
+                f'≤ {share} %', 100)
+            for share in (1, 5)
+        ),
+        *(
+            Row(f'First match right, set {name}: shared space / teacher', '{:.1f} / {:.1f} %',
+                (f'recall.{name}.shared.r1', f'recall.{name}.teacher.r1'), '', 100)
+            for name in _SETS
+        ),
+        *(
+            Row(f'Wrong matches found, AUROC, set {name}: combined / distance / u_EV',
+                '{:.2f} / {:.2f} / {:.2f}',
+                tuple(f'failure.{name}.{score}.auroc'
+                      for score in ('shared_combined', 'distance', 'shared_u')))
+            for name in _SETS
+        ),
+        Row('MinkLoc3D embedding / five members', '{:.0f} / {:.0f} ms',
+            ('embed_ms', 'five_members_ms'), '≤ 80 / 160 ms'),
+        Row('Query among 18,000 / 1,000,000', '{:.2f} / {:.1f} ms',
+            ('query_ms.18000', 'query_ms.1000000')),
+        Row('Gate in the aliased district: registrations without / with', '{:.0f} / {:.0f}',
+            ('gate.off.registered', 'gate.on.registered')),
+        Row('— true loops', '{:.0f} / {:.0f}', ('gate.off.true', 'gate.on.true')),
+        Row('— false loops', '{:.0f} / {:.0f}', ('gate.off.false', 'gate.on.false'), '0'),
+        Row('— ATE', '{:.2f} / {:.2f} m', ('gate.off.ate_m', 'gate.on.ate_m')),
+    )),
+    'cmrnet': Table(
+        'cmrnet_ekf',
+        tuple(_localized(*way) for way in _WAYS.items()),
+        ('single pass', 'error, median / mean', 'rotation', 'off by more than 1 m',
+         'calibration error x / y / yaw', 'mean error when the unsure are rejected'),
+        'localization',
+    ),
+    'tracking': Table(
+        'cmrnet_ekf',
+        tuple(
+            WideRow(what, tuple(
+                Cell('{:.2f}' + unit, (f'ekf.{way}.{key}',))
+                for key, unit in (('t_median_m', ' m'), ('t_mean_m', ' m'), ('t_max_m', ' m'),
+                                  ('r_median_deg', '°'))))
+            for way, what in _TRACKED.items()
+        ),
+        ('closed loop', 'median', 'mean', 'largest', 'rotation, median'),
+        'ekf',
+    ),
+    'ekf': Table('cmrnet_ekf', (
+        Row('Epochs with ANEES inside the 95 % band, 50 runs', '{:.1f} %',
+            ('consistency.anees_inside_share',), '≥ 90 %', 100),
+        Row('Mean NEES of a pose', '{:.2f}', ('consistency.anees_mean',), '6'),
+        Row('NIS of camera / wheels / GNSS', '{:.2f} / {:.2f} / {:.2f}',
+            ('consistency.nis_camera', 'consistency.nis_wheels', 'consistency.nis_gnss'),
+            '6 / 1 / 3'),
+        Row('Posterior after delays up to 1 s, difference', '{:.0g}',
+            ('consistency.order_difference',), '0'),
+        Row('KITTI 00, GPS away for 60 s, mean error: ekf / without biases', '{:.1f} / {:.1f} m',
+            ('real.kitti_00.ekf.outage_mean_m', 'real.kitti_00.without_biases.outage_mean_m')),
+        Row("— GTSAM's example, live / smoothed at the end", '{:.0f} / {:.1f} m',
+            ('real.kitti_00.gtsam_every_fix.outage_mean_m',
+             'real.kitti_00.gtsam_every_fix_smoothed.outage_mean_m')),
+        Row('KITTI-360, one street, median error: guesses / DER / fine-tuned there',
+            '{:.2f} / {:.2f} / {:.2f} m',
+            tuple(f'real.kitti_360.{key}.t_median_m'
+                  for key in ('rough', 'der_before', 'der_after'))),
+        Row('IMU samples a second', '{:,.0f}', ('imu_hz',), '≥ 10,000'),
+        Row('LiDAR image of 700,000 points', '{:.0f} ms', ('lidar_image_ms',), '≤ 60 ms'),
+        Row('Compact CMRNet with DER, steps a second', '{:.0f}', ('step_hz.compact_cpu',), '≥ 5'),
+        Row('30 draws of MC dropout, beside one pass', '{:.2f} ×', ('mcd_cost_ratio',), '≤ 1.3 ×'),
+    )),
+}  # fmt: skip
