@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 from benchmarks.loop_pairs import T_BASE_LIDAR
 from benchmarks.peer_candidates import judged, map_closures
 from lcd_common import se3
-from lcd_loop_closure.evaluation.detection_protocols import PrecisionRecall, protocol_1
+from lcd_loop_closure.evaluation.detection_protocols import (
+    Candidates,
+    PrecisionRecall,
+    protocol_1,
+)
 from lcd_loop_closure.evaluation.sweep_store import StoredSweeps
 
 
@@ -24,18 +28,21 @@ def judge_map_closures(
         work: folder for the sweeps in KITTI's layout, removed again.
         sweeps: to judge.
         reverse: [Q] as `Detection.reverse` of the same sweeps.
-        kind: class of the revisits, all, same_way or reverse.
+        kind: class of the revisits, same_way or reverse.
     """
+    found = map_closure_candidates(work, sweeps)
+    return protocol_1(found.select(~found.loop | (reverse if kind == 'reverse' else ~reverse)))
+
+
+def map_closure_candidates(work: Path, sweeps: StoredSweeps) -> Candidates:
+    """Return which earlier sweep each one shows by MapClosures; see `judge_map_closures`."""
     root = work / f'kitti_{sweeps.name}'
     T_world_lidar = sweeps.T_world_base @ T_BASE_LIDAR
     try:
         run = map_closures(_kitti_sequence(sweeps, T_world_lidar, root), work)
     finally:
         shutil.rmtree(root, ignore_errors=True)
-    found = judged(run, T_world_lidar)
-    if kind != 'all':
-        found = found.select(~found.loop | (reverse if kind == 'reverse' else ~reverse))
-    return protocol_1(found)
+    return judged(run, T_world_lidar)
 
 
 def _kitti_sequence(sweeps: StoredSweeps, T_world_lidar: se3.Array, root: Path) -> Path:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from bags.drives import open_drive
 from benchmarks.lcdnet_drives import METHODS, methods
+from benchmarks.lcdnet_peers import map_closure_candidates
 from benchmarks.loop_pairs import (
     DIFFERENT_PLACE_M,
     T_BASE_LIDAR,
@@ -18,9 +19,11 @@ from benchmarks.loop_pairs import (
     clouds,
     kitti_00,
 )
+from benchmarks.peers import PeerError
 from benchmarks.recordings import folder, karlsruhe_out_and_back
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
+from lcd_loop_closure.evaluation.detection_protocols import protocol_1
 from lcd_loop_closure.evaluation.drive_sweeps import store_drive
 from lcd_loop_closure.evaluation.lcdnet_registration import (
     LcdnetFast,
@@ -116,6 +119,13 @@ def out_and_back(work: Path) -> dict[str, Any]:
         ):
             figures.setdefault(protocol, {})[name] = curves['all'].average_precision
         figures.setdefault('recall_1', {})[name] = one.detection.found.recall_1
+    try:
+        found = map_closure_candidates(work, sweeps)
+    except PeerError as error:
+        figures.setdefault('missing', {})['map_closures'] = str(error)
+        return figures
+    figures['ap_protocol1']['map_closures'] = protocol_1(found).average_precision
+    figures['recall_1']['map_closures'] = found.recall_1
     return figures
 
 

@@ -124,10 +124,10 @@ TABLES: dict[str, Table] = {
             '≤ 0.35 m, 0.6°'),
         Row('Real pairs of different places, rejected', '{:,.0f} of {:,.0f}',
             ('real.kitti_00.negatives_rejected', 'real.kitti_00.negatives'), 'all'),
-        Row('Karlsruhe out and back, average precision: LCDNet / Scan Context / M2DP',
+        Row('Karlsruhe out and back, average precision: LCDNet / Scan Context / MapClosures',
             '{:.3f} / {:.3f} / {:.3f}',
             tuple(f'real.out_and_back.ap_protocol1.{method}'
-                  for method in ('lcdnet', 'scan_context', 'm2dp')), 'LCDNet the best'),
+                  for method in ('lcdnet', 'scan_context', 'map_closures')), 'LCDNet the best'),
         Row('Loops that the nodes close there, right / wrong: LCDNet (Scan Context)',
             '{:.0f} / {:.0f} ({:.0f} / {:.0f})',
             tuple(f'loops_of_the_nodes.out_and_back.{method}.{kind}'
