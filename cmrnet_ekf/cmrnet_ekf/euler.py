@@ -91,6 +91,17 @@ def quaternion_of_euler(euler: Tensor) -> Tensor:
     )
 
 
+def rotation_tensor(euler: Tensor) -> Tensor:
+    """Return rotation matrices [B x 3 x 3] of roll pitch yaw [B x 3]."""
+    (sr, sp, sy), (cr, cp, cy) = (f(euler).unbind(-1) for f in (torch.sin, torch.cos))
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
 def wrapped_tensor(angle: Tensor) -> Tensor:
     """Return angles within -pi .. pi; the gradient is that of the angle."""
     return angle - 2.0 * torch.pi * torch.round(angle / (2.0 * torch.pi))

@@ -62,10 +62,19 @@ class Cmrnet(nn.Module):
             image: [B x 3 x H x W] uint8 RGB (or float, 0..255).
             lidar: [B x H x W] depth in metres, 0 where nothing is seen.
         """
+        return self.features(self.correlation(image, lidar))
+
+    def correlation(self, image: Tensor, lidar: Tensor) -> Tensor:
+        """Return how alike cells of both are [B x (2d+1)^2 x rows x columns]; see `correlate`."""
         seen = self.image_pyramid((image.float() / 255.0 - self.mean) / self.std)
         mapped = self.lidar_pyramid(lidar[:, None] / self.settings.max_depth)
-        x = correlate(seen, mapped, self.settings.displacement)
-        x = functional.leaky_relu(x, _SLOPE)
+        if self.settings.standardised:
+            seen, mapped = _standardised(seen), _standardised(mapped)
+        return correlate(seen, mapped, self.settings.displacement)
+
+    def features(self, correlation: Tensor) -> Tensor:
+        """Return features [B x F] of a correlation."""
+        x = functional.leaky_relu(correlation, _SLOPE)
         for layer in self.estimator:
             x = torch.cat([layer(x), x], 1)
         if self.squeeze is not None:
@@ -74,6 +83,12 @@ class Cmrnet(nn.Module):
             size = self.settings.pooled_rows, self.settings.pooled_columns
             x = functional.adaptive_avg_pool2d(x, size)
         return x.flatten(1)
+
+
+def _standardised(x: Tensor) -> Tensor:
+    """Give the features of each cell mean 0 and variance 1, but where there are none."""
+    x = x.float() - x.float().mean(1, keepdim=True)
+    return x / (x.square().mean(1, keepdim=True) + 1e-4).sqrt()
 
 
 def _pyramid(channels: int, s: CmrnetConfig) -> nn.Sequential:

@@ -34,6 +34,11 @@ class CmrnetConfig:
         (16, 32, 64, 96, 128, 196), 'channels of the levels, each half as fine as the one before'
     )
     convolutions: int = setting(3, 'of a level', low=1, high=5)
+    standardised: bool = setting(
+        False,
+        'features of a cell get mean 0, variance 1 before they are correlated (not in CMRNet); '
+        'a correlation then says how alike cells are from the first batch on',
+    )
     displacement: int = setting(4, 'cells that the correlation looks to each side', low=1, high=10)
     estimator: tuple[int, ...] = setting(
         (128, 128, 96, 64, 32), 'channels that the layers after the correlation add'

@@ -26,6 +26,12 @@ class LossConfig:
     density_floor: float = setting(0.04, 'lower densities count as that', low=1e-6)
     scale_rotation: float = setting(1.0, 's_rot', low=0.0)
     scale_translation: float = setting(1.0, 's_tr', low=0.0)
+    matching_weight: float = setting(
+        0.0, 'weight of the matching loss, which is not in the thesis', low=0.0
+    )
+    matching_sharpness: float = setting(
+        10.0, 'factor of the correlation before the softmax of the matching loss', low=0.1
+    )
     lambda_rotation: float = setting(0.01, 'weight of L^R of rotations', low=0.0)
     lambda_translation: float = setting(0.1, 'weight of L^R of translations', low=0.0)
     evidence_first: float = setting(0.1, 's^evd of the first step of training', low=0.0)

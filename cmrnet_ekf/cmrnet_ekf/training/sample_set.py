@@ -9,7 +9,7 @@ places.npy     [F x 4 x 4] T_map_camera, axes forward, left, up (sets of before 
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +31,23 @@ _MIRRORED = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 
 @dataclass(frozen=True)
 class Batch:
-    """What a step of training sees: see `Cmrnet.trunk`; target [B x 6] of T_guess_camera."""
+    """What a step of training sees.
+
+    Attributes:
+        image, lidar: see `Cmrnet.trunk`.
+        target: [B x 6] components of T_guess_camera.
+        camera: [B x 4] fx fy cx cy, pixels; NaN where they are not known.
+    """
 
     image: Tensor
     lidar: Tensor
     target: Tensor
+    camera: Tensor
 
     def to(self, device: torch.device) -> 'Batch':
         """Return the batch on a device."""
-        return Batch(self.image.to(device), self.lidar.to(device), self.target.to(device))
+        parts = (self.image, self.lidar, self.target, self.camera)
+        return Batch(*(part.to(device) for part in parts))
 
 
 class SampleSet:
@@ -70,6 +78,7 @@ class SampleSet:
         if not len(self.lidar) == len(self.frame_of) == len(self.guesses) > 0:
             raise DataError(f'{path}: its parts have different lengths; make the samples anew')
         self._targets = targets(np.asarray(self.guesses))
+        self._pinhole = _pinhole(self.facts)
         there = (path / 'places.npy').is_file()
         self.T_map_camera: Array | None = np.load(path / 'places.npy') if there else None
 
@@ -102,7 +111,22 @@ class SampleSet:
         """Return samples [B]."""
         image = torch.from_numpy(self.frames[self.frame_of[index]]).permute(0, 3, 1, 2)
         depth = self.lidar[index].astype(np.float32) * (self.facts['max_depth'] / FULL_SCALE)
-        return Batch(image, torch.from_numpy(depth), torch.from_numpy(self._targets[index]).float())
+        target = torch.from_numpy(self._targets[index]).float()
+        return Batch(image, torch.from_numpy(depth), target, self._pinhole.expand(len(index), 4))
+
+    @property
+    def pinhole(self) -> bool:
+        """Whether the camera is known and its images are free of distortion."""
+        return bool(self._pinhole.isfinite().all())
+
+
+def _pinhole(facts: dict[str, Any]) -> Tensor:
+    """Return fx fy cx cy; NaN for images with distortion, and in sets of before these were kept."""
+    camera = facts.get('camera', {'distortion': [1.0]})
+    if any(camera['distortion']):
+        return torch.full((4,), torch.nan)
+    (fx, _, cx), (_, fy, cy) = camera['K'][:2]
+    return torch.tensor([fx, fy, cx, cy], dtype=torch.float32)
 
 
 def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment: bool) -> Batch:
@@ -119,12 +143,13 @@ def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment:
         torch.cat([p.image for p in parts]),
         torch.cat([p.lidar for p in parts]),
         torch.cat([p.target for p in parts]),
+        torch.cat([p.camera for p in parts]),
     )
     if not augment:
         return batch
     image = jittered(batch.image.float(), rng)
     mirror = torch.from_numpy(rng.random(count) < 0.5)
-    return mirrored(Batch(image, batch.lidar, batch.target), mirror)
+    return mirrored(replace(batch, image=image), mirror)
 
 
 def mirrored(batch: Batch, which: Tensor) -> Batch:
@@ -134,10 +159,13 @@ def mirrored(batch: Batch, which: Tensor) -> Batch:
     point sees of the mirrored map.
     """
     keep = which.view(-1, 1, 1, 1)
+    fx, fy, cx, cy = batch.camera.unbind(1)
+    flipped = torch.stack([fx, fy, batch.image.shape[3] - 1 - cx, cy], 1)
     return Batch(
         torch.where(keep, batch.image.flip(3), batch.image),
         torch.where(keep[:, 0], batch.lidar.flip(2), batch.lidar),
         torch.where(which.view(-1, 1), batch.target * _MIRRORED, batch.target),
+        torch.where(which.view(-1, 1), flipped, batch.camera),
     )
 
 

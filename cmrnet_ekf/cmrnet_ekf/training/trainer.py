@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.networks.losses import LossConfig, pose_losses
-from cmrnet_ekf.training.sample_set import SampleSet, draw
+from cmrnet_ekf.networks.matching import cell_matches, matching_loss
+from cmrnet_ekf.training.sample_set import Batch, SampleSet, draw
 from lcd_common import weights_file
 from lcd_common.errors import ConfigError, LocalizationError
 from lcd_common.settings import config, setting
@@ -49,6 +50,7 @@ class Step:
     translation: float
     rotation: float
     evidence: float
+    matching: float
     gradient: float
     learning_rate: float
     seconds: float
@@ -79,6 +81,11 @@ class Trainer:
                 raise ConfigError(
                     f'{one.path}: samples of images {one.images}, the network takes '
                     f'{network.settings.images}; make samples for this network'
+                )
+            if loss.matching_weight and not one.pinhole:
+                raise ConfigError(
+                    f'{one.path}: the matching loss needs images without distortion and samples '
+                    'that say of which camera; rectify them, or set matching_weight to 0'
                 )
         self.device = torch.device(device)
         self.network = network.to(self.device)
@@ -156,11 +163,14 @@ class Trainer:
             group['lr'] = self._learning_rate()
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=s.half):
-            output = self.network(batch.image, batch.lidar)
+            correlation = self.network.correlation(batch.image, batch.lidar)
+            output = self.network.head(self.network.features(correlation))
         evidence = self._loss.evidence_scale(self.step / s.steps)
         losses = pose_losses(output, batch.target, self._loss, evidence)
+        matching = self._matching(correlation, batch)
+        total = losses.total + self._loss.matching_weight * matching
         self.optimizer.zero_grad(set_to_none=True)
-        losses.total.backward()  # type: ignore[no-untyped-call]
+        total.backward()  # type: ignore[no-untyped-call]
         limit = s.clip or float('inf')
         gradient = float(nn.utils.clip_grad_norm_(self.network.parameters(), limit))
         if np.isfinite(gradient):
@@ -168,14 +178,25 @@ class Trainer:
         self.step += 1
         return Step(
             self.step,
-            float(losses.total.detach()),
+            float(total.detach()),
             float(losses.translation.detach()),
             float(losses.rotation.detach()),
             float(losses.evidence.detach()),
+            float(matching.detach()),
             gradient,
             self._learning_rate(),
             time.monotonic() - begin,
         )
+
+    def _matching(self, correlation: Tensor, batch: Batch) -> Tensor:
+        if not self._loss.matching_weight:
+            return correlation.new_zeros(())
+        rows, columns = correlation.shape[2:]
+        displacement = self.network.settings.displacement
+        matches = cell_matches(
+            batch.lidar, batch.target, batch.camera, (rows, columns), displacement
+        )
+        return matching_loss(correlation, matches, self._loss.matching_sharpness)
 
 
 def _short(value: float) -> float:

@@ -21,7 +21,7 @@ def test_a_mirrored_sample_is_what_is_seen_of_the_mirrored_street():
     T_camera_guess = euler.transforms([0.5, -1.0, 0.2, 0.1, -0.05, 0.15])
     lidar = imager_of(camera, SMALL).image(points, T_OPTICAL_BODY @ se3.inverse(T_camera_guess))
     target = torch.from_numpy(targets(T_camera_guess[None])).float()
-    batch = Batch(torch.zeros(1, 3, 32, 64), lidar[None], target)
+    batch = Batch(torch.zeros(1, 3, 32, 64), lidar[None], target, torch.ones(1, 4))
     flipped = mirrored(batch, torch.tensor([True]))
 
     M = np.diag([1.0, -1.0, 1.0, 1.0])
