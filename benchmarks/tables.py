@@ -108,6 +108,10 @@ TABLES: dict[str, Table] = {
                 ('ap_unseen_beams32', 'a sensor unseen in training', ''),
             )
         ),
+        Row('Protocol 1, town 200, a second run among other cars: LCDNet (M2DP, Scan Context)',
+            '{:.3f} ({:.3f}, {:.3f})',
+            tuple(f'ap_other_traffic.protocol1.all.{method}'
+                  for method in ('lcdnet', 'm2dp', 'scan_context')), '≥ 0.97, the best'),
         *(
             row
             for band, asked in (('0_4', '≥ 99.5 %'), ('4_10', ''), ('10_15', '≥ 90 %'))
