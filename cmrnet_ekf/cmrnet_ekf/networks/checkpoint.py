@@ -35,3 +35,26 @@ def load_network(path: Path, device: torch.device | str = 'cpu') -> tuple[Cmrnet
     except (KeyError, TypeError, AttributeError, RuntimeError, ConfigError) as error:
         raise DataError(f'{path}: the weights do not fit the network: {error}') from error
     return network.to(device).eval(), stored.facts
+
+
+def begin_from(network: Cmrnet, path: Path) -> list[str]:
+    """Give a network the weights of a file; its head may be another.
+
+    Returns:
+        The tensors of the head that stay as they were, because the file's have another shape.
+
+    Raises:
+        ConfigError: other layers differ, so that nothing could be taken over.
+        DataError: the file holds no network.
+    """
+    theirs, own = load_network(path)[0].state_dict(), network.state_dict()
+    fitting = {k: v for k, v in theirs.items() if k in own and own[k].shape == v.shape}
+    fresh = [name for name in own if name not in fitting]
+    others = [name for name in fresh if not name.startswith('head.')]
+    if others:
+        raise ConfigError(
+            f'{path}: expected a network of the same shape but for its head, but '
+            f'{others[0]} differs; give the same --network and --set'
+        )
+    network.load_state_dict(fitting, strict=False)
+    return fresh

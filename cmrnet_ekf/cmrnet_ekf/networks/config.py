@@ -85,6 +85,7 @@ COMPACT = CmrnetConfig(
     occlusion_radius=3,
     pyramid=(16, 24, 40, 64),
     convolutions=2,
+    standardised=True,
     estimator=(64, 48, 48, 32, 32),
     squeezed=24,
     pooled_rows=4,

@@ -38,6 +38,8 @@ examples:
   train_cmrnet ... --out runs/nll --variant der --loss density=log one row of Table 5.2
   train_cmrnet ... --out runs/tuned --from runs/der/best.safetensors --train steps=500
                                                                    fine-tune on other samples
+  train_cmrnet ... --out runs/der --variant der --from runs/plain/best.safetensors
+                                                                   learn to doubt on a trained trunk
 
 variants:
 """
@@ -65,7 +67,9 @@ def _train(arguments: argparse.Namespace) -> None:
     torch.manual_seed(chosen.training.seed)
     network = Cmrnet(chosen.network)
     if arguments.start:
-        network.load_state_dict(checkpoint.load_network(arguments.start)[0].state_dict())
+        fresh = checkpoint.begin_from(network, arguments.start)
+        if fresh:
+            _log.info('%s: of another head; new: %s', arguments.start, ', '.join(fresh))
     trainer = Trainer(
         network, sets, arguments.out, chosen.training, chosen.loss, choose_device(arguments.device)
     )
@@ -159,7 +163,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--variant', choices=sorted(VARIANTS), default='plain', help='(default: plain)')
     add('--network', choices=sorted(NETWORKS), default='compact', help='(default: compact)')
     add('--seed', type=int, default=0, help='of weights and draws (default: 0)')
-    add('--from', dest='start', type=Path, metavar='WEIGHTS', help='network to begin with')
+    add('--from', dest='start', type=Path, metavar='WEIGHTS',
+        help='network to begin with; its head may be another')  # fmt: skip
     add('--minutes', type=float, help='stop after this time; the same command goes on later')
     add('--validate-every', type=int, default=500, metavar='STEPS', help='(default: 500)')
     add('--validation-samples', type=int, metavar='N', help='of each set (default: all)')
