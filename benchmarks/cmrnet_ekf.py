@@ -6,11 +6,12 @@
     python -m benchmarks.cmrnet_ekf --list                 the sections and what they measure
     python -m benchmarks.cmrnet_ekf --work build/ekf       keep samples, maps, tracks and pictures
 
-CMRNET_WEIGHTS names the folder of trained networks, one for each role: cmrnet, mcd, de, der; what
-else is there (nll, covariance) is judged beside them, and second/<role> and third/<role> refine in
-stages. A role is a .safetensors file, a folder of train_cmrnet, or, as an ensemble, a folder of
-such. What the work folder holds is not made again: with it, consistency is also measured with the
-errors that ekf's cameras made. Exits with 1 when a section failed or a required figure is missing.
+CMRNET_WEIGHTS names the folder of trained networks, one for each role: cmrnet, mcd, de, der; a role
+that is missing is left out. What else is there (nll, covariance) is judged beside them, and
+second/<role> and third/<role> refine in stages. A role is a .safetensors file, a folder of
+train_cmrnet, or, as an ensemble, a folder of such. What the work folder holds is not made again:
+with it, consistency is also measured with the errors that ekf's cameras made. Exits with 1 when a
+section failed or a required figure is missing.
 """
 
 import sys

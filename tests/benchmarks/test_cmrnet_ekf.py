@@ -100,8 +100,31 @@ def test_weights_are_found_by_role(weights):
     assert list(cmrnet_sets.predictors()) == ['cmrnet', 'mcd', 'de', 'der', 'der_log']
     assert list(cmrnet_sets.predictors(others=False)) == ['cmrnet', 'mcd', 'de', 'der']
     (weights / 'cmrnet.safetensors').unlink()
-    with pytest.raises(DataError, match='cmrnet is missing'):
+    assert list(cmrnet_sets.predictors(others=False)) == ['mcd', 'de', 'der']
+
+
+def test_a_folder_without_any_role_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv('CMRNET_WEIGHTS', str(tmp_path))
+    with pytest.raises(DataError, match='expected cmrnet, mcd, de, der in it, or some of them'):
         cmrnet_sets.predictors()
+
+
+def test_relations_are_told_of_the_networks_that_are_there():
+    errors = {'rough': 1.9, 'cmrnet': 0.5, 'der': 0.6}
+    found = cmrnet_methods.relations(
+        {
+            'localization': {role: {'t_mean_m': mean} for role, mean in errors.items()},
+            'rejection': {'der': {'t_mean_m': 0.55}},
+            'calibration': {'der': {'x': 0.04, 'y': 0.06, 'yaw': 0.05}},
+        }
+    )
+    assert found == {
+        'most_accurate': 'cmrnet',
+        'missing': ['de', 'mcd'],
+        'der_to_cmrnet_t_mean': pytest.approx(1.2),
+        'rejection_lowers_t_mean': {'der': True},
+        'der_calibrated_within_0_05': {'x': True, 'y': False, 'yaw': True},
+    }
 
 
 def test_without_weights_a_section_says_so(monkeypatch, tmp_path):
