@@ -1,7 +1,7 @@
 """Features of sweeps, computed once: what the place head learns from while the rest is at rest."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -18,6 +18,8 @@ from lcd_loop_closure.lcdnet.augmentation import AugmentationConfig, augmented
 from lcd_loop_closure.lcdnet.network import Lcdnet
 from lcd_loop_closure.lcdnet.places import PlaceSweep, thinned
 from lcd_loop_closure.lcdnet.voxels import Clouds
+
+_BETWEEN_RUNS_M = 1000.0
 
 
 class DriveSweeps(Protocol):
@@ -145,6 +147,18 @@ def around_loops(drive: DriveSweeps, *, loop_m: float, around_m: float) -> NDArr
     path_m = np.concatenate([[0.0], np.cumsum(step_m)])
     loops = ((away <= loop_m) & (np.abs(path_m[:, None] - path_m) > 50.0)).any(1)
     return np.flatnonzero((away[:, loops] <= around_m).any(1))
+
+
+def near_spots(drive: DriveSweeps, spots: NDArray[np.float64], around_m: float) -> NDArray[np.intp]:
+    """Return the sweeps [K] of a drive within a distance of some spots [S x 3]."""
+    away = np.linalg.norm(drive.T_world_base[:, None, :3, 3] - spots, axis=2)
+    return np.flatnonzero((away <= around_m).any(1))
+
+
+def second_run(first: PlaceFeatures, second: PlaceFeatures) -> PlaceFeatures:
+    """Return both runs through a town as one drive: whatever the second sees is a return."""
+    after_m = float(first.path_m.max()) + _BETWEEN_RUNS_M
+    return joined_features([first, replace(second, path_m=second.path_m + after_m)])
 
 
 def joined_features(parts: Sequence[PlaceFeatures]) -> PlaceFeatures:

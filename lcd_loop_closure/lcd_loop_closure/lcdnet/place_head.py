@@ -156,11 +156,19 @@ class Neighbourhoods:
 
 
 @torch.inference_mode()
-def judge_place_head(network: Lcdnet, features: PlaceFeatures) -> PrecisionRecall:
+def judge_place_head(
+    network: Lcdnet, features: PlaceFeatures, first: int | None = None
+) -> PrecisionRecall:
     """Return precision and recall by protocol 1 on one drive, its features not augmented.
 
     Of a drive with a sweep each three metres the latest 17 are left out, the 50 metres that 50
     scans of a sweep each metre are.
+
+    Args:
+        network: to judge.
+        features: of the drive.
+        first: sweep from which on places are asked for: where a second run begins; None: as soon
+            as there is a past.
     """
     head = network.place.eval()
     device = next(head.parameters()).device
@@ -174,6 +182,6 @@ def judge_place_head(network: Lcdnet, features: PlaceFeatures) -> PrecisionRecal
     found = candidates(
         lambda i, m: np.linalg.norm(descriptors[:m] - descriptors[i], axis=1),
         features.position.numpy(),
-        RevisitConfig(excluded_scans=late, first_scan=2 * late),
+        RevisitConfig(excluded_scans=late, first_scan=2 * late if first is None else first),
     )
     return protocol_1(found)

@@ -27,6 +27,8 @@ from lcd_loop_closure.lcdnet.place_features import (
     around_loops,
     drive_features,
     joined_features,
+    near_spots,
+    second_run,
 )
 from lcd_loop_closure.lcdnet.place_head import PlaceHeadConfig, judge_place_head, train_place_head
 from lcd_loop_closure.lcdnet.training_drives import simulated_drive
@@ -36,6 +38,7 @@ examples:
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head --set place_ranges=12
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head --train steps=2000
+  train_lcdnet_place_head runs/head/best.safetensors --out runs/head2 --towns 36 --again 12
 
 Drives through training towns 0, 1, ... and validation towns 100, 101, ... are simulated first, then
 the features of all their sweeps are computed; both are kept in --data, so that the same command
@@ -58,18 +61,22 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.set:
         network = _begun_anew(network, changed(network.settings, arguments.set), device)
     made_by = hashlib.sha256(arguments.weights.read_bytes()).hexdigest()
-    judged = [
-        _features(network, made_by, 100 + town, None, arguments)
-        for town in range(arguments.validation_towns)
-    ]
+    judged: list[tuple[PlaceFeatures, int | None]] = []
+    for town in range(100, 100 + arguments.validation_towns):
+        once = _features(network, made_by, town, None, arguments)
+        judged.append((once, None))
+        if arguments.again:
+            again = _features(network, made_by, town, None, arguments, once)
+            judged.append((second_run(once, again), len(once)))
     # A shift would move the sensor's shadows away from the sensor.
     augmentation = AugmentationConfig(shift=0.0)
-    features = joined_features(
-        [
-            _features(network, made_by, town, augmentation, arguments)
-            for town in range(arguments.towns)
-        ]
-    )
+    drives = []
+    for town in range(arguments.towns):
+        drives.append(_features(network, made_by, town, augmentation, arguments))
+        if town < arguments.again:
+            again = _features(network, made_by, town, augmentation, arguments, drives[-1])
+            drives[-1] = second_run(drives[-1], again)
+    features = joined_features(drives)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     best, rows = _score(network, judged), []
@@ -117,20 +124,29 @@ def _features(
     town: int,
     augmentation: AugmentationConfig | None,
     arguments: argparse.Namespace,
+    before: PlaceFeatures | None = None,
 ) -> PlaceFeatures:
-    """Return the features of the drive through a town, from the folder where they are there."""
+    """Return the features of the drive through a town, from the folder where they are there.
+
+    With those of the run before, of the second one: its sweeps near those of the first.
+    """
     data: Path = arguments.data or arguments.out / 'drives'
-    path = data / f'features_{town:03d}.safetensors'
+    run = 0 if before is None else 1
+    path = data / f'features_{town:03d}{"_run1" if run else ""}.safetensors'
     if (kept := PlaceFeatures.load(path, made_by)) is not None:
         return kept
     with tqdm(desc=f'casting town {town}', unit='sweep', disable=arguments.quiet) as bar:
-        drive = simulated_drive(data, town, lambda done, of: _advance(bar, of))
+        drive = simulated_drive(data, town, lambda done, of: _advance(bar, of), run)
     # Far from its loops a drive teaches little, but it can be mistaken for them.
-    chosen = None if augmentation is None else around_loops(drive, loop_m=4.0, around_m=20.0)
+    chosen = None
+    if augmentation is not None:
+        chosen = around_loops(drive, loop_m=4.0, around_m=20.0)
+        if before is not None:
+            chosen = near_spots(drive, before.position.numpy(), around_m=3.0)
     total = len(drive) if chosen is None else len(chosen)
     with tqdm(total=total, unit='sweep', desc='features', disable=arguments.quiet) as bar:
         features = drive_features(
-            network, drive, town, augmentation, chosen=chosen, progress=bar.update
+            network, drive, town, augmentation, chosen=chosen, seed=run, progress=bar.update
         )
     features.save(path, made_by)
     return features
@@ -141,9 +157,9 @@ def _advance(bar: Any, of: int) -> None:
     bar.update()
 
 
-def _score(network: Lcdnet, judged: Sequence[PlaceFeatures]) -> float:
+def _score(network: Lcdnet, judged: Sequence[tuple[PlaceFeatures, int | None]]) -> float:
     """Return the mean average precision over the validation drives."""
-    return float(np.mean([judge_place_head(network, one).average_precision for one in judged]))
+    return float(np.mean([judge_place_head(network, *one).average_precision for one in judged]))
 
 
 def _keep(
@@ -156,7 +172,8 @@ def _keep(
 ) -> None:
     """Write the network with its card: the whole network's, and the head's added."""
     head = {
-        'trained_on': f'simulation only: drives through towns 0 to {arguments.towns - 1}',
+        'trained_on': f'simulation only: drives through towns 0 to {arguments.towns - 1}, '
+        f'{arguments.again} of them twice, among other cars',
         'chosen_on': f'drives through {arguments.validation_towns} validation towns from 100 on',
         'command': 'train_lcdnet_place_head ' + ' '.join(sys.argv[1:]),
         'training': asdict(settings),
@@ -183,6 +200,9 @@ def _parser() -> argparse.ArgumentParser:
     add('--out', type=Path, required=True, help='folder of the training')
     add('--data', type=Path, help='folder of drives and features (default: drives in --out)')
     add('--towns', type=int, default=20, help='training towns, at most 100 (default: 20)')
+    add('--again', type=int, default=0, metavar='TOWNS',
+        help='so many of them are driven twice, the second time among other cars, and so are the '
+        'validation towns (default: 0)')  # fmt: skip
     add('--validation-towns', type=int, default=3, help='at most 10 (default: 3)')
     add('--validate-every', type=int, default=100, metavar='STEPS', help='(default: 100)')
     add('--device', default='auto', help='auto, cpu, cuda, cuda:1 ... (default: auto)')

@@ -13,13 +13,17 @@ _SENSORS = ('hdl64', 'hdl64', 'os1_64', 'vlp16')
 
 
 def simulated_drive(
-    folder: Path, town: int, progress: Callable[[int, int], None] = lambda done, of: None
+    folder: Path,
+    town: int,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+    run: int = 0,
 ) -> StoredSweeps:
     """Return the sweeps of a drive through a town, cast the first time (needs the package bags).
 
-    Training towns (below 100) come with several sensors, validation towns with KITTI's.
+    Training towns (below 100) come with several sensors, validation towns with KITTI's. Another
+    run takes the same streets among other cars.
     """
-    path = folder / f'drive_{town:03d}'
+    path = folder / f'drive_{town:03d}{f"_run{run}" if run else ""}'
     if not is_stored(path):
         from bags.simulation.drive import SensorsConfig, SimulatedDrive
         from bags.simulation.itinerary import JourneyConfig
@@ -32,7 +36,7 @@ def simulated_drive(
             lateral=1.5,
         )
         lidar = _SENSORS[town // 5 % len(_SENSORS)] if town < 100 else 'hdl64'
-        drive = SimulatedDrive(town, 0, journey, SensorsConfig(lidar=lidar, imu='', gnss=False))
+        drive = SimulatedDrive(town, run, journey, SensorsConfig(lidar=lidar, imu='', gnss=False))
         drive.name = path.name
         store_drive(drive, path, spacing_m=SPACING_M, progress=progress)
     return StoredSweeps(path)

@@ -21,6 +21,8 @@ from lcd_loop_closure.lcdnet.place_features import (
     around_loops,
     drive_features,
     joined_features,
+    near_spots,
+    second_run,
 )
 from lcd_loop_closure.lcdnet.place_head import (
     Neighbourhoods,
@@ -234,3 +236,25 @@ def test_the_command_trains_and_keeps_a_card(tmp_path, capsys):
     assert (out / 'place_head.png').stat().st_size > 3000
     assert train_place_head.main([*command, '--set', 'voxel=0.3']) == 1
     assert 'may change the place head alone' in capsys.readouterr().err
+
+
+def test_whatever_a_second_run_sees_is_a_return():
+    made, first = features(1)
+    second = drive_features(made, Drive(0), 0, AugmentationConfig(shift=0.0), seed=1)
+    both = second_run(first, second)
+    n = len(first)
+    assert len(both) == 2 * n and not torch.equal(both.values[:n], both.values[n:])
+    same, away = Neighbourhoods(both, PlaceHeadConfig()).relations(np.arange(2 * n))
+    between = away[:n, n:]
+    assert np.isfinite(between).all() and same[:n, n:].diagonal().all()
+    expected = (first.position[:, None] - second.position).norm(dim=2).numpy()
+    np.testing.assert_allclose(between, expected, atol=1e-9)
+    curve = judge_place_head(made, both, first=n)
+    assert curve.loops == n, 'each sweep of the second run has its place in the first'
+
+
+def test_sweeps_near_spots_are_found_by_their_poses():
+    drive = Drive(0)
+    spots = drive.T_world_base[[3, 10], :3, 3] + [0.0, 0.5, 0.0]
+    away = np.linalg.norm(drive.T_world_base[:, None, :3, 3] - spots, axis=2).min(1)
+    assert near_spots(drive, spots, 1.0).tolist() == np.flatnonzero(away <= 1.0).tolist()
