@@ -101,6 +101,8 @@ def _replay(nodes: Sequence[Any], drive: Drive, start_s: float = 0.0, listened: 
 def run(options: argparse.Namespace) -> None:
     """Do both passes and say how well they agree."""
     drive = open_input(options.source)
+    if drive.camera is None:
+        raise DataError(f'{options.source}: has no camera; bags simulate --camera --imu makes one')
     rclpy.init(args=[])
     try:
         poses = build(drive, options.out)

@@ -42,6 +42,9 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     run = _run(str(EXAMPLES / 'slam_in_one_process.py'), '--map', str(tmp_path / 'nothing'))
     assert run.returncode == 1
     assert 'found none; check the path' in run.stderr
+    run = _run(str(EXAMPLES / 'map_then_localize.py'), 'street', '--out', str(tmp_path / 'mapped'))
+    assert run.returncode == 1
+    assert run.stderr.startswith('error: street: has no camera') and run.stderr.count('\n') == 1
     script = str(EXAMPLES / 'slam_with_place_recognition.py')
     run = _run(script, '--weights', str(tmp_path / 'nothing'))
     assert run.returncode == 1
