@@ -47,6 +47,7 @@ class Predictor:
         self.networks = [network.eval() for network in networks]
         self.settings = networks[0].settings
         self._samples, self._seed = samples, seed
+        self._masks = _FixedMasks(self.settings.dropout, seed)
 
     @classmethod
     def load(
@@ -118,15 +119,30 @@ class Predictor:
     def _dropped(self, network: Cmrnet, features: Tensor) -> Array:
         """Return sampled components [S x B x 6] of features [B x F]."""
         count, batch = self._samples, len(features)
-        devices = [features.device] if features.device.type == 'cuda' else []
-        with torch.random.fork_rng(devices=devices):
-            torch.manual_seed(self._seed)
-            network.head.dropout.train()
-            try:
-                output = network.head(features.repeat(count, 1))
-            finally:
-                network.head.dropout.eval()
+        self._masks.begin()
+        output = network.head(features.repeat(count, 1), self._masks)
         return means(output).reshape(count, batch, 6)
+
+
+class _FixedMasks:
+    """Drop inputs as dropout does, but the same ones at every pass: drawn once, not every time."""
+
+    def __init__(self, share: float, seed: int) -> None:
+        self._share, self._seed, self._asked = share, seed, 0
+        self._masks: dict[tuple[int, tuple[int, ...], torch.device], Tensor] = {}
+
+    def begin(self) -> None:
+        """Begin a pass."""
+        self._asked = 0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        key = self._asked, tuple(x.shape), x.device
+        self._asked += 1
+        if key not in self._masks:
+            generator = torch.Generator().manual_seed(self._seed * 1000 + key[0])
+            kept = torch.rand(key[1], generator=generator) >= self._share
+            self._masks[key] = (kept / (1.0 - self._share)).to(x)
+        return x * self._masks[key]
 
 
 def weights_in(path: Path) -> list[Path]:

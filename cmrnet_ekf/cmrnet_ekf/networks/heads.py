@@ -1,5 +1,7 @@
 """Turn features into a pose: one shared layer, then a branch each for translation and rotation."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -43,28 +45,31 @@ class PoseHead(nn.Module):
             elif self.correlated is not None:
                 self.correlated.weight *= 0.1
 
-    def forward(self, features: Tensor) -> Output:
-        """Return the output of features [B x F]; in training mode, or while sampling, of a draw.
+    def forward(
+        self, features: Tensor, dropout: Callable[[Tensor], Tensor] | None = None
+    ) -> Output:
+        """Return the output of features [B x F]; in training mode of a draw.
 
-        Computed in full precision even under autocast: distributions end where half rounds to.
+        With a `dropout` of somebody else's it is asked in place of the head's own. Computed in full
+        precision even under autocast: distributions end where half rounds to.
         """
         with torch.autocast(features.device.type, enabled=False):
-            return self._output(features.float())
+            return self._output(features.float(), dropout or self.dropout)
 
-    def _output(self, features: Tensor) -> Output:
-        x = functional.leaky_relu(self.shared(self.dropout(features)), _SLOPE)
+    def _output(self, features: Tensor, dropout: Callable[[Tensor], Tensor]) -> Output:
+        x = functional.leaky_relu(self.shared(dropout(features)), _SLOPE)
         near = [
-            functional.leaky_relu(branch[0](self.dropout(x)), _SLOPE)
+            functional.leaky_relu(branch[0](dropout(x)), _SLOPE)
             for branch in (self.translation, self.rotation)
         ]
-        t = self.translation[1](self.dropout(near[0]))
-        r = self.rotation[1](self.dropout(near[1]))
+        t = self.translation[1](dropout(near[0]))
+        r = self.rotation[1](dropout(near[1]))
         if self.settings.head == 'quaternion':
             return QuaternionPose(t, functional.normalize(r, dim=1))
         if self.settings.head == 'evidential':
             return _evidence(torch.cat([t.view(-1, 4, 3), r.view(-1, 4, 3)], dim=2))
         assert self.correlated is not None
-        root = _lower_triangle(self.correlated(self.dropout(torch.cat(near, 1))))
+        root = _lower_triangle(self.correlated(dropout(torch.cat(near, 1))))
         return GaussianPose(torch.cat([t, r], 1), root)
 
 
