@@ -152,7 +152,7 @@ def run_once(drive: ReferenceDrive, seed: int, camera: CameraErrors | None = Non
 
 
 def consistency(
-    runs: int = 50, seconds: float = 60.0, camera: CameraErrors | None = None
+    runs: int, seconds: float = 60.0, camera: CameraErrors | None = None
 ) -> dict[str, Any]:
     """Return ANEES, NIS and autocorrelation over runs on the same drive with other noise.
 

@@ -74,7 +74,9 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         ),
         'map_closures': (
             'the same of MapClosures on shorter drives, with LCDNet and Scan Context beside it',
-            partial(lcdnet_drives.map_closures, length_m=400.0 if quick else 800.0),
+            partial(lcdnet_drives.map_closures, length_m=400.0)
+            if quick
+            else lcdnet_drives.map_closures,
         ),
         'changed': (
             'a repeated run with other traffic, and a sensor that training did not see',
@@ -102,7 +104,7 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         ),
         'ablations': (
             'variants of the network, trained alike and briefly: Tables 3.8 and 3.9',
-            partial(lcdnet_ablations.ablations, steps=10 if quick else 80),
+            partial(lcdnet_ablations.ablations, steps=10) if quick else lcdnet_ablations.ablations,
         ),
         'speed': ('times by stage, and how they grow', lcdnet_speed.evaluate),
     }

@@ -92,8 +92,8 @@ def detection(work: Path, towns: int = 3) -> dict[str, Any]:
 def map_closures(work: Path, length_m: float = 800.0) -> dict[str, Any]:
     """Return MapClosures' average precision by class, protocol 1, and that of others beside it.
 
-    Its time grows with the square of the way, to an hour for a drive as long as the others'; so it
-    is given shorter ones through the first town, and the others are judged on these too.
+    Its time grows with the square of the way, so it is given shorter drives through the first town,
+    and the others are judged on these too.
     """
     found: dict[str, dict[str, float]] = {}
     for kind in CLASSES:

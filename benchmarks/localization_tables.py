@@ -94,7 +94,7 @@ LOCALIZATION_TABLES = {
         'ekf',
     ),
     'ekf': Table('cmrnet_ekf', (
-        Row('Epochs with ANEES inside the 95 % band, 50 runs', '{:.1f} %',
+        Row('Epochs with ANEES inside the 95 % band, groups of 50 runs', '{:.1f} %',
             ('consistency.anees_inside_share',), '≥ 90 %', 100),
         Row('Mean NEES of a pose', '{:.2f}', ('consistency.anees_mean',), '6'),
         Row('NIS of camera / wheels / GNSS', '{:.2f} / {:.2f} / {:.2f}',

@@ -59,15 +59,14 @@ def build(drive: Drive, out: Path) -> Trajectory:
 def localize(drive: Drive, out: Path, start_s: float, weights: str) -> list[tuple[int, se3.Array]]:
     """Find and track the vehicle in the map; return what ekf says, stamps with T_map_base."""
     found: list[tuple[int, se3.Array]] = []
-    start: list[float] = []
 
     def on_estimate(message: Odometry) -> None:
         stamp_ns = messages.stamp_ns(message.header.stamp)
         found.append((stamp_ns, messages.transform_from_pose(message.pose.pose)))
 
     def on_start(message: PoseWithCovarianceStamped) -> None:
-        start.append(messages.stamp_ns(message.header.stamp) * 1e-9)
-        sys.stdout.write(f'found by place recognition at {start[-1]:.1f} s\n')
+        stamp_s = messages.stamp_ns(message.header.stamp) * 1e-9
+        sys.stdout.write(f'found by place recognition at {stamp_s:.1f} s\n')
 
     inside: dict[str, Any] = {'threaded': False}
     known = overrides(map=str(out / 'places'), grow=False, relocalize=True, **inside)
@@ -111,6 +110,8 @@ def run(options: argparse.Namespace) -> None:
         rclpy.try_shutdown()
     mapped = [(T, poses.at(stamp_ns)) for stamp_ns, T in found]
     off = np.array([se3.distance(T, at) for T, at in mapped if at is not None])
+    if not len(off):
+        raise DataError('the first pass has no pose at the time of the second; try another --start')
     sys.stdout.write(
         f'{len(found)} poses by camera and IMU; off the first pass: '
         f'median {np.median(off[:, 0]):.2f} m, {np.degrees(np.median(off[:, 1])):.2f} degrees, '

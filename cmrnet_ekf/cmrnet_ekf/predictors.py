@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from cmrnet_ekf import euler
 from cmrnet_ekf.networks.checkpoint import load_network
@@ -47,7 +48,8 @@ class Predictor:
         self.networks = [network.eval() for network in networks]
         self.settings = networks[0].settings
         self._samples, self._seed = samples, seed
-        self._masks = _FixedMasks(self.settings.dropout, seed)
+        # Of the last shape of features: the seed draws the same every time.
+        self._masks: tuple[tuple[torch.Size, torch.device], list[Tensor]] | None = None
 
     @classmethod
     def load(
@@ -119,30 +121,27 @@ class Predictor:
     def _dropped(self, network: Cmrnet, features: Tensor) -> Array:
         """Return sampled components [S x B x 6] of features [B x F]."""
         count, batch = self._samples, len(features)
-        self._masks.begin()
-        output = network.head(features.repeat(count, 1), self._masks)
+        repeated = features.repeat(count, 1)
+        key = repeated.shape, repeated.device
+        if self._masks is None or self._masks[0] != key:
+            self._masks = key, self._drawn_masks(network, repeated)
+        masks = iter(self._masks[1])
+        output = network.head(repeated, lambda x: x * next(masks))
         return means(output).reshape(count, batch, 6)
 
+    def _drawn_masks(self, network: Cmrnet, features: Tensor) -> list[Tensor]:
+        """Return what dropout multiplies with, layer by layer, when it draws with the seed."""
+        masks: list[Tensor] = []
 
-class _FixedMasks:
-    """Drop inputs as dropout does, but the same ones at every pass: drawn once, not every time."""
+        def drop(x: Tensor) -> Tensor:
+            masks.append(functional.dropout(torch.ones_like(x), self.settings.dropout))
+            return x * masks[-1]
 
-    def __init__(self, share: float, seed: int) -> None:
-        self._share, self._seed, self._asked = share, seed, 0
-        self._masks: dict[tuple[int, tuple[int, ...], torch.device], Tensor] = {}
-
-    def begin(self) -> None:
-        """Begin a pass."""
-        self._asked = 0
-
-    def __call__(self, x: Tensor) -> Tensor:
-        key = self._asked, tuple(x.shape), x.device
-        self._asked += 1
-        if key not in self._masks:
-            generator = torch.Generator().manual_seed(self._seed * 1000 + key[0])
-            kept = torch.rand(key[1], generator=generator) >= self._share
-            self._masks[key] = (kept / (1.0 - self._share)).to(x)
-        return x * self._masks[key]
+        devices = [features.device] if features.device.type == 'cuda' else []
+        with torch.random.fork_rng(devices=devices):
+            torch.manual_seed(self._seed)
+            network.head(features, drop)
+        return masks
 
 
 def weights_in(path: Path) -> list[Path]:

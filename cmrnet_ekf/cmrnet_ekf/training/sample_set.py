@@ -78,7 +78,10 @@ class SampleSet:
         if not len(self.lidar) == len(self.frame_of) == len(self.guesses) > 0:
             raise DataError(f'{path}: its parts have different lengths; make the samples anew')
         self._targets = targets(np.asarray(self.guesses))
-        self._pinhole = _pinhole(self.facts)
+        self._pinhole = torch.full((4,), torch.nan)
+        if 'camera' in self.facts and not any(self.camera.distortion):
+            K = self.camera.K
+            self._pinhole = torch.tensor([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).float()
         there = (path / 'places.npy').is_file()
         self.T_map_camera: Array | None = np.load(path / 'places.npy') if there else None
 
@@ -118,15 +121,6 @@ class SampleSet:
     def pinhole(self) -> bool:
         """Whether the camera is known and its images are free of distortion."""
         return bool(self._pinhole.isfinite().all())
-
-
-def _pinhole(facts: dict[str, Any]) -> Tensor:
-    """Return fx fy cx cy; NaN for images with distortion, and in sets of before these were kept."""
-    camera = facts.get('camera', {'distortion': [1.0]})
-    if any(camera['distortion']):
-        return torch.full((4,), torch.nan)
-    (fx, _, cx), (_, fy, cy) = camera['K'][:2]
-    return torch.tensor([fx, fy, cx, cy], dtype=torch.float32)
 
 
 def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment: bool) -> Batch:

@@ -138,11 +138,12 @@ def _features(
     with tqdm(desc=f'casting town {town}', unit='sweep', disable=arguments.quiet) as bar:
         drive = simulated_drive(data, town, lambda done, of: _advance(bar, of), run)
     # Far from its loops a drive teaches little, but it can be mistaken for them.
-    chosen = None
-    if augmentation is not None:
+    if augmentation is None:
+        chosen = None
+    elif before is None:
         chosen = around_loops(drive, loop_m=4.0, around_m=20.0)
-        if before is not None:
-            chosen = near_spots(drive, before.position.numpy(), around_m=3.0)
+    else:
+        chosen = near_spots(drive, before.position.numpy(), around_m=3.0)
     total = len(drive) if chosen is None else len(chosen)
     with tqdm(total=total, unit='sweep', desc='features', disable=arguments.quiet) as bar:
         features = drive_features(
