@@ -95,8 +95,12 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
             partial(lcdnet_registration.initial_guess, pairs=10 if quick else 60),
         ),
         'real': (
-            'real sweeps: a pair from any yaw, negatives, the out-and-back drive, neighbours',
-            partial(lcdnet_real.evaluate, sweep_step=10 if quick else 1),
+            'places of real sweeps: the out-and-back drive, neighbours',
+            lcdnet_real.places,
+        ),
+        'real_registration': (
+            'registration of real sweeps: a pair from any yaw, different places',
+            partial(lcdnet_real.pairs, sweep_step=10 if quick else 1),
         ),
         'loops': (
             'loops that the nodes accept, LCDNet beside Scan Context',
@@ -117,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _placed(figures: dict[str, Any], section: str, new: dict[str, Any]) -> Mapping[str, Any]:
     """Put a section's figures at the top, by their names; what a later run adds stays beside."""
-    if section in ('detection', 'map_closures', 'real'):
+    if section in ('detection', 'map_closures', 'real', 'real_registration'):
         return {**figures, **{k: _joined(figures.get(k, {}), v) for k, v in new.items()}}
     return {**figures, **new}
 

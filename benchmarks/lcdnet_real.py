@@ -39,13 +39,21 @@ from lcd_loop_closure.pair_registration import PreparedCloud
 from lcd_loop_closure.revisits import RevisitConfig
 
 
-def evaluate(work: Path, sweep_step: int = 1) -> dict[str, Any]:
-    """Measure all of this; `sweep_step` takes every n-th Karlsruhe sweep for negatives."""
-    figures: dict[str, Any] = {'out_and_back': out_and_back(work)}
+def places(work: Path) -> dict[str, Any]:
+    """Tell places: the out-and-back drive, and frames beside their neighbours."""
+    return {
+        'real': {
+            'out_and_back': out_and_back(work),
+            'neighbours': neighbours(methods().lcdnet),
+        }
+    }
+
+
+def pairs(work: Path, sweep_step: int = 1) -> dict[str, Any]:
+    """Register a true pair and different places, every `sweep_step`-th Karlsruhe sweep's."""
     network = methods().lcdnet
-    figures['kitti_00'] = {**true_pair(network), **negatives(network, work, sweep_step)}
-    figures['neighbours'] = neighbours(network)
-    return {'real': figures}
+    found = {**true_pair(network), **negatives(network, work, sweep_step)}
+    return {'real': {'kitti_00': found}}
 
 
 def true_pair(network: LcdnetDescriptor, yaws: int = YAWS) -> dict[str, Any]:

@@ -68,7 +68,9 @@ def draw_place_head(rows: Sequence[Mapping[str, float]], path: Path) -> None:
         label='share of confused loops',
     )
     left.legend()
-    right.plot([row['step'] for row in rows], [row['average_precision'] for row in rows], '.-')
+    for name, label in (('average_precision', 'whole'), ('without_sectors', 'without sectors')):
+        right.plot([row['step'] for row in rows], [row[name] for row in rows], '.-', label=label)
+    right.legend()
     right.set_title('average precision on validation drives')
     for axis in (left, right):
         axis.set_xlabel('step')

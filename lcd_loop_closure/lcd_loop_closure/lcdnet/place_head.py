@@ -157,7 +157,10 @@ class Neighbourhoods:
 
 @torch.inference_mode()
 def judge_place_head(
-    network: Lcdnet, features: PlaceFeatures, first: int | None = None
+    network: Lcdnet,
+    features: PlaceFeatures,
+    first: int | None = None,
+    hidden: PlaceHeadConfig | None = None,
 ) -> PrecisionRecall:
     """Return precision and recall by protocol 1 on one drive, its features not augmented.
 
@@ -169,13 +172,18 @@ def judge_place_head(
         features: of the drive.
         first: sweep from which on places are asked for: where a second run begins; None: as soon
             as there is a past.
+        hidden: leaves out a sector of each sweep and some keypoints, as in training; None: all is
+            seen.
     """
     head = network.place.eval()
     device = next(head.parameters()).device
-    parts = [
-        network.describe(values.to(device).float(), at.to(device).float()).cpu()
-        for values, at in zip(features.values.split(32), features.keypoints.split(32), strict=True)
-    ]
+    rng, parts = np.random.default_rng(97), []
+    for rows in torch.arange(len(features)).split(32):
+        if hidden is None:
+            values, at = features.values[rows].float(), features.keypoints[rows].float()
+        else:
+            values, at = _some_keypoints(features, rows.numpy(), hidden, rng)
+        parts.append(network.describe(values.to(device), at.to(device)).cpu())
     descriptors = torch.cat(parts).numpy()
     gap = float(np.median(np.diff(features.path_m.numpy())))
     late = max(1, round(50.0 / max(gap, 0.1)))

@@ -43,7 +43,8 @@ examples:
 Drives through training towns 0, 1, ... and validation towns 100, 101, ... are simulated first, then
 the features of all their sweeps are computed; both are kept in --data, so that the same command
 goes on where it was stopped. --out gets best.safetensors (the whole network, its head the best on
-the validation drives), its card best.json, place_head.jsonl and place_head.png.
+the validation drives, whole and with sectors left out as in training), its card best.json,
+place_head.jsonl and place_head.png.
 """
 
 
@@ -79,21 +80,19 @@ def _train(arguments: argparse.Namespace) -> None:
     features = joined_features(drives)
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    best, rows = _score(network, judged), []
-    rows.append({'step': 0, 'average_precision': best})
+    rows = [{'step': 0, **_scores(network, judged, settings)}]
+    best = _mean(rows[0])
     with tqdm(total=settings.steps, unit='step', desc='place head', disable=arguments.quiet) as bar:
         for step, loss, confused in train_place_head(network, features, settings):
             bar.update()
             bar.set_postfix(loss=f'{loss:.3f}', confused=f'{confused:.2f}', best=f'{best:.3f}')
             if step % arguments.validate_every and step != settings.steps:
                 continue
-            score = _score(network, judged)
+            scores = _scores(network, judged, settings)
             network.place.train()
-            rows.append(
-                {'step': step, 'loss': loss, 'confused': confused, 'average_precision': score}
-            )
-            if score > best:
-                best = score
+            rows.append({'step': step, 'loss': loss, 'confused': confused, **scores})
+            if _mean(scores) > best:
+                best = _mean(scores)
                 _keep(out, network, facts, rows[-1], settings, arguments)
             _write(out, rows)
     if not (out / 'best.safetensors').is_file():
@@ -158,9 +157,22 @@ def _advance(bar: Any, of: int) -> None:
     bar.update()
 
 
-def _score(network: Lcdnet, judged: Sequence[tuple[PlaceFeatures, int | None]]) -> float:
-    """Return the mean average precision over the validation drives."""
-    return float(np.mean([judge_place_head(network, *one).average_precision for one in judged]))
+def _scores(
+    network: Lcdnet,
+    judged: Sequence[tuple[PlaceFeatures, int | None]],
+    settings: PlaceHeadConfig,
+) -> dict[str, float]:
+    """Return mean average precisions over the validation drives, whole and without sectors."""
+    return {
+        name: float(
+            np.mean([judge_place_head(network, *one, hidden).average_precision for one in judged])
+        )
+        for name, hidden in (('average_precision', None), ('without_sectors', settings))
+    }
+
+
+def _mean(scores: dict[str, float]) -> float:
+    return (scores['average_precision'] + scores['without_sectors']) / 2.0
 
 
 def _keep(

@@ -182,6 +182,11 @@ def test_drives_are_judged_by_protocol_1():
     drive = drive_features(made, Drive(0), 0, None)
     curve = judge_place_head(made, drive)
     assert curve.loops > 0 and 0.0 <= curve.average_precision <= 1.0
+    shown = [judge_place_head(made, drive, hidden=PlaceHeadConfig(keypoints=k)) for k in (32, 16)]
+    assert [one.loops for one in shown] == [curve.loops] * 2
+    again = judge_place_head(made, drive, hidden=PlaceHeadConfig(keypoints=16))
+    assert shown[1].average_precision == again.average_precision, 'the same is left out each time'
+    assert shown[1].average_precision != curve.average_precision
 
 
 def test_only_what_lies_around_loops_is_taken():
@@ -233,6 +238,7 @@ def test_the_command_trains_and_keeps_a_card(tmp_path, capsys):
     assert json.loads((out / 'best.json').read_text())['place_head']['training']['steps'] == 20
     rows = [json.loads(line) for line in (out / 'place_head.jsonl').read_text().splitlines()]
     assert [row['step'] for row in rows] == [0, 10, 20]
+    assert all(0.0 <= row['without_sectors'] <= 1.0 for row in rows)
     assert (out / 'place_head.png').stat().st_size > 3000
     assert train_place_head.main([*command, '--set', 'voxel=0.3']) == 1
     assert 'may change the place head alone' in capsys.readouterr().err
