@@ -57,7 +57,7 @@ def _run(benchmark: Benchmark, arguments: argparse.Namespace) -> int:
     known = benchmark.sections(arguments.quick)
     if arguments.list:
         for name, (text, _) in known.items():
-            print(f'{name:<15}{text}')
+            print(f'{name:<19}{text}')
         return 0
     unknown = sorted(set(arguments.only or ()) - set(known))
     if unknown:
