@@ -1,6 +1,7 @@
 """Train LCDNet's place head on drives: the command `train_lcdnet_place_head`."""
 
 import argparse
+import copy
 import hashlib
 import json
 import sys
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from lcd_common.command_line import run
@@ -38,7 +40,7 @@ examples:
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head --set place_ranges=12
   train_lcdnet_place_head runs/compact/best.safetensors --out runs/head --train steps=2000
-  train_lcdnet_place_head runs/head/best.safetensors --out runs/head2 --towns 36 --again 12
+  train_lcdnet_place_head runs/head/best.safetensors --out runs/head2 --again 20 --mix 0.5
 
 Drives through training towns 0, 1, ... and validation towns 100, 101, ... are simulated first, then
 the features of all their sweeps are computed; both are kept in --data, so that the same command
@@ -81,22 +83,23 @@ def _train(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     rows = [{'step': 0, **_scores(network, judged, settings)}]
-    best = _mean(rows[0])
+    best, before = _mean(rows[0]), copy.deepcopy(network.place.state_dict())
     with tqdm(total=settings.steps, unit='step', desc='place head', disable=arguments.quiet) as bar:
         for step, loss, confused in train_place_head(network, features, settings):
             bar.update()
             bar.set_postfix(loss=f'{loss:.3f}', confused=f'{confused:.2f}', best=f'{best:.3f}')
             if step % arguments.validate_every and step != settings.steps:
                 continue
-            scores = _scores(network, judged, settings)
+            mixed = _mixed(network, before, arguments.mix)
+            scores = _scores(mixed, judged, settings)
             network.place.train()
             rows.append({'step': step, 'loss': loss, 'confused': confused, **scores})
             if _mean(scores) > best:
                 best = _mean(scores)
-                _keep(out, network, facts, rows[-1], settings, arguments)
+                _keep(out, mixed, facts, rows[-1], settings, arguments)
             _write(out, rows)
     if not (out / 'best.safetensors').is_file():
-        _keep(out, network, facts, rows[-1], settings, arguments)
+        _keep(out, mixed, facts, rows[-1], settings, arguments)
 
 
 def _begun_anew(network: Lcdnet, settings: LcdnetConfig, device: torch.device) -> Lcdnet:
@@ -157,6 +160,21 @@ def _advance(bar: Any, of: int) -> None:
     bar.update()
 
 
+def _mixed(network: Lcdnet, before: dict[str, Tensor], share: float) -> Lcdnet:
+    """Return the network with its place head part of the way back to what it was.
+
+    Between the two, what was known and what is new go together (Wortsman et al., Robust
+    fine-tuning of zero-shot models, CVPR 2022).
+    """
+    if not share:
+        return network
+    mixed = copy.deepcopy(network)
+    for name, value in mixed.place.state_dict().items():
+        if value.is_floating_point():
+            value.lerp_(before[name], share)
+    return mixed
+
+
 def _scores(
     network: Lcdnet,
     judged: Sequence[tuple[PlaceFeatures, int | None]],
@@ -190,6 +208,7 @@ def _keep(
         'chosen_on': f'drives through {arguments.validation_towns} validation towns from 100 on',
         'command': 'train_lcdnet_place_head ' + ' '.join(sys.argv[1:]),
         'training': asdict(settings),
+        'share_of_the_head_before': arguments.mix,
         'validation': row,
     }
     card = {**facts, 'place_head': head, 'torch': torch.__version__}
@@ -200,6 +219,12 @@ def _keep(
 def _write(out: Path, rows: list[dict[str, float]]) -> None:
     (out / 'place_head.jsonl').write_text(''.join(json.dumps(row) + '\n' for row in rows))
     draw_place_head(rows, out / 'place_head.png')
+
+
+def _share(text: str) -> float:
+    if not 0.0 <= (value := float(text)) < 1.0:
+        raise argparse.ArgumentTypeError(f'expected 0 or more and less than 1, got {text}')
+    return value
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -217,6 +242,9 @@ def _parser() -> argparse.ArgumentParser:
         help='so many of them are driven twice, the second time among other cars, and so are the '
         'validation towns (default: 0)')  # fmt: skip
     add('--validation-towns', type=int, default=3, help='at most 10 (default: 3)')
+    add('--mix', type=_share, default=0.0, metavar='SHARE',
+        help='of the weights before in the head that is judged and kept: it forgets less '
+        '(default: 0)')  # fmt: skip
     add('--validate-every', type=int, default=100, metavar='STEPS', help='(default: 100)')
     add('--device', default='auto', help='auto, cpu, cuda, cuda:1 ... (default: auto)')
     add('--threads', type=int, help='of the CPU (default: all)')

@@ -230,18 +230,33 @@ def test_the_command_trains_and_keeps_a_card(tmp_path, capsys):
                 writer.add(k, drive.cloud(k), drive.T_world_base[k])
     command = [str(weights), '--out', str(out), '--data', str(data), '--towns', '1']
     command += ['--validation-towns', '1', '--validate-every', '10', '--quiet', '--device', 'cpu']
-    command += ['--threads', '1', '--train', 'steps=20', 'groups=2', 'sweeps=6']
+    command += ['--threads', '1', '--mix', '0.5', '--train', 'steps=20', 'groups=2', 'sweeps=6']
     assert train_place_head.main([*command, '--set', 'place_ranges=4']) == 0
     made, facts = checkpoint.load_network(out / 'best.safetensors')
     assert made.settings.place_ranges == 4 and facts['training'] == {'steps': 1}
     assert facts['place_head']['trained_on'].startswith('simulation only')
-    assert json.loads((out / 'best.json').read_text())['place_head']['training']['steps'] == 20
+    card = json.loads((out / 'best.json').read_text())['place_head']
+    assert card['training']['steps'] == 20 and card['share_of_the_head_before'] == 0.5
     rows = [json.loads(line) for line in (out / 'place_head.jsonl').read_text().splitlines()]
     assert [row['step'] for row in rows] == [0, 10, 20]
     assert all(0.0 <= row['without_sectors'] <= 1.0 for row in rows)
     assert (out / 'place_head.png').stat().st_size > 3000
     assert train_place_head.main([*command, '--set', 'voxel=0.3']) == 1
     assert 'may change the place head alone' in capsys.readouterr().err
+
+
+def test_weights_lie_between_before_and_after():
+    after = network()
+    start = {k: v + 1.0 for k, v in after.place.state_dict().items()}
+    assert train_place_head._mixed(after, start, 0.0) is after
+    mixed = train_place_head._mixed(after, start, 0.25)
+    for name, value in mixed.place.state_dict().items():
+        own = after.place.state_dict()[name]
+        expected = 0.75 * own + 0.25 * start[name] if own.is_floating_point() else own
+        torch.testing.assert_close(value, expected)
+    torch.testing.assert_close(mixed.state_dict(), {**after.state_dict(), **{
+        f'place.{k}': v for k, v in mixed.place.state_dict().items()
+    }})  # fmt: skip
 
 
 def test_whatever_a_second_run_sees_is_a_return():
