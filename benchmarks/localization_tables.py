@@ -1,8 +1,7 @@
-"""What the tables about place recognition, CMRNet and the EKF show of their result files."""
+"""What the tables about CMRNet and the EKF show of benchmarks/results/cmrnet_ekf.json."""
 
 from benchmarks.result_table import Cell, Row, Table, WideRow
 
-_SETS = ('town', 'town_far', 'sensor', 'aliased')
 _WAYS = {'rough': 'the guesses', 'cmrnet': 'CMRNet', 'mcd': 'MC dropout', 'de': 'deep ensemble',
          'der': 'evidential regression'}  # fmt: skip
 _UNCERTAIN = ('mcd', 'de', 'der')
@@ -36,44 +35,6 @@ def _localized(way: str, what: str) -> WideRow:
 
 
 LOCALIZATION_TABLES = {
-    'place_recognition': Table('place_recognition', (
-        *(
-            Row(f'False matches, {share} % promised', '{:.1f} % ({:.1f} to {:.1f})',
-                tuple(f'guarantee.target_{share:02d}.{key}' for key in ('observed', 'low', 'high')),
-                f'≤ {share} %', 100)
-            for share in (1, 5)
-        ),
-        *(
-            Row(f'First match right, set {name}: shared space / teacher', '{:.1f} / {:.1f} %',
-                (f'recall.{name}.shared.r1', f'recall.{name}.teacher.r1'), '', 100)
-            for name in _SETS
-        ),
-        *(
-            Row(f'Wrong matches found, AUROC, set {name}: combined / distance / u_EV',
-                '{:.2f} / {:.2f} / {:.2f}',
-                tuple(f'failure.{name}.{score}.auroc'
-                      for score in ('shared_combined', 'distance', 'shared_u')))
-            for name in _SETS
-        ),
-        Row('MinkLoc3D embedding / five members', '{:.0f} / {:.0f} ms',
-            ('embed_ms', 'five_members_ms'), '≤ 80 / 160 ms'),
-        Row('Query among 18,000 / 1,000,000', '{:.2f} / {:.1f} ms',
-            ('query_ms.18000', 'query_ms.1000000')),
-        Row('Real out-and-back drive: returns recognised first', '{:.0f} %',
-            ('real.out_and_back.recall_1_of_revisits',), '', 100),
-        Row('— answers accepted / of them wrong', '{:.0f} / {:.0f}',
-            ('real.out_and_back.accepted', 'real.out_and_back.accepted_wrong')),
-        Row('Uncertainty tells a removed half / sixteen beams from a clean sweep, AUROC',
-            '{:.2f} / {:.2f}', ('real.changed_inputs.sector_180.auroc',
-                                'real.changed_inputs.sixteen_beams.auroc'), '> 0.5'),
-        Row('Gate in the aliased district: registrations without / with', '{:.0f} / {:.0f}',
-            ('gate.off.registered', 'gate.on.registered')),
-        Row('— of them of different places', '{:.0f} / {:.0f}',
-            ('gate.off.false_registered', 'gate.on.false_registered')),
-        Row('— true loops', '{:.0f} / {:.0f}', ('gate.off.true', 'gate.on.true')),
-        Row('— false loops', '{:.0f} / {:.0f}', ('gate.off.false', 'gate.on.false'), '0'),
-        Row('— ATE', '{:.2f} / {:.2f} m', ('gate.off.ate_m', 'gate.on.ate_m')),
-    )),
     'cmrnet': Table(
         'cmrnet_ekf',
         tuple(_localized(*way) for way in _WAYS.items()),

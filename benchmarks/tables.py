@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.lcdnet_tables import LCDNET_TABLES
 from benchmarks.localization_tables import LOCALIZATION_TABLES
+from benchmarks.place_tables import PLACE_TABLES
 from benchmarks.result_table import Row, Table
 from benchmarks.town_tables import TOWN_TABLES
 from lcd_common.command_line import run
@@ -26,6 +27,7 @@ _BLOCK = re.compile(r'(<!-- table:([\w-]+) -->\n)(.*?)(<!-- end -->)', re.DOTALL
 TABLES: dict[str, Table] = {
     **TOWN_TABLES,
     **LCDNET_TABLES,
+    **PLACE_TABLES,
     **LOCALIZATION_TABLES,
     'drive': Table('drive', (
         Row('Real out-and-back drive, live at 1x: scans that odometry lost', '{:.0f}',

@@ -1,0 +1,124 @@
+"""What the tables about place recognition show of benchmarks/results/place_recognition.json."""
+
+from benchmarks.result_table import Cell, Row, Table, WideRow
+
+_SETS = ('town', 'town_far', 'sensor', 'aliased')
+_METHODS = {
+    'teacher': 'teacher alone',
+    'student': 'student alone',
+    'shared': 'shared-space ensemble',
+    'naive': 'naive ensemble',
+    'mason': 'Mason et al. (a database a member)',
+    'dropout': 'MC dropout',
+    'stun': 'aleatoric student (STUN)',
+}
+_SCORES = {
+    'shared_combined': 'shared space, combined',
+    'shared_u': 'shared space, u_EV',
+    'naive': 'naive ensemble, u_EV',
+    'mason_variance': 'Mason et al., variance',
+    'mason_similarity': 'Mason et al., similarity',
+    'dropout': 'MC dropout, u_EV',
+    'stun': 'aleatoric student, variance',
+    'distance': 'distance alone',
+}
+_MEMBERS = {'triplet': 'from scratch', 'distilled': 'distilled'}
+_ARCHITECTURES = {'minkloc3d': 'MinkLoc3D', 'pointnetvlad': 'PointNetVLAD'}
+
+
+def _exchanged(architecture: str, kind: str) -> WideRow:
+    figures = f'interchange.{kind}.{architecture}'
+    return WideRow(
+        f'{_ARCHITECTURES[architecture]}, {_MEMBERS[kind]}',
+        tuple(
+            Cell('{:.1f} %', (f'{figures}.{name}',), 100)
+            for name in ('diagonal_r1', 'off_diagonal_r1', 'chance_r1')
+        ),
+    )
+
+
+def _recalled(method: str, what: str) -> WideRow:
+    return WideRow(
+        what,
+        tuple(
+            Cell(
+                '{:.1f} / {:.1f} / {:.1f}',
+                tuple(f'recall.{name}.{method}.{figure}' for figure in ('r1', 'r5', 'r10')),
+                100,
+            )
+            for name in _SETS
+        ),
+    )
+
+
+def _found(score: str, what: str) -> WideRow:
+    return WideRow(
+        what,
+        tuple(
+            Cell(
+                '{:.3f} / {:.3f} / {:.2f}',
+                tuple(f'failure.{name}.{score}.{figure}' for figure in ('auroc', 'aurc', 'fpr95')),
+            )
+            for name in _SETS
+        ),
+    )
+
+
+PLACE_TABLES = {
+    'place_recognition': Table('place_recognition', (
+        *(
+            Row(f'False matches, {share} % promised', '{:.1f} % ({:.1f} to {:.1f})',
+                tuple(f'guarantee.target_{share:02d}.{key}' for key in ('observed', 'low', 'high')),
+                f'≤ {share} %', 100)
+            for share in (1, 5)
+        ),
+        *(
+            Row(f'First match right, set {name}: shared space / teacher', '{:.1f} / {:.1f} %',
+                (f'recall.{name}.shared.r1', f'recall.{name}.teacher.r1'), '', 100)
+            for name in _SETS
+        ),
+        *(
+            Row(f'Wrong matches found, AUROC, set {name}: combined / distance / u_EV',
+                '{:.2f} / {:.2f} / {:.2f}',
+                tuple(f'failure.{name}.{score}.auroc'
+                      for score in ('shared_combined', 'distance', 'shared_u')))
+            for name in _SETS
+        ),
+        Row('MinkLoc3D embedding / five members', '{:.0f} / {:.0f} ms',
+            ('embed_ms', 'five_members_ms'), '≤ 80 / 160 ms'),
+        Row('Query among 18,000 / 1,000,000', '{:.2f} / {:.1f} ms',
+            ('query_ms.18000', 'query_ms.1000000')),
+        Row('Real out-and-back drive: returns recognised first', '{:.0f} %',
+            ('real.out_and_back.recall_1_of_revisits',), '', 100),
+        Row('— answers accepted / of them wrong', '{:.0f} / {:.0f}',
+            ('real.out_and_back.accepted', 'real.out_and_back.accepted_wrong')),
+        Row('Uncertainty tells a removed half / sixteen beams from a clean sweep, AUROC',
+            '{:.2f} / {:.2f}', ('real.changed_inputs.sector_180.auroc',
+                                'real.changed_inputs.sixteen_beams.auroc'), '> 0.5'),
+        Row('Gate in the aliased district: registrations without / with', '{:.0f} / {:.0f}',
+            ('gate.off.registered', 'gate.on.registered')),
+        Row('— of them of different places', '{:.0f} / {:.0f}',
+            ('gate.off.false_registered', 'gate.on.false_registered')),
+        Row('— true loops', '{:.0f} / {:.0f}', ('gate.off.true', 'gate.on.true')),
+        Row('— false loops', '{:.0f} / {:.0f}', ('gate.off.false', 'gate.on.false'), '0'),
+        Row('— ATE', '{:.2f} / {:.2f} m', ('gate.off.ate_m', 'gate.on.ate_m')),
+    )),
+    'place_interchange': Table(
+        'place_recognition',
+        tuple(_exchanged(one, kind) for one in _ARCHITECTURES for kind in _MEMBERS),
+        ('five members', 'searched in their own map', "in another member's", 'by chance'),
+        'interchange',
+    ),
+    'place_recall': Table(
+        'place_recognition',
+        tuple(_recalled(*one) for one in _METHODS.items()),
+        ('recall at 1 / 5 / 10, %', *_SETS),
+        'recall',
+    ),
+    'place_failure': Table(
+        'place_recognition',
+        tuple(_found(*one) for one in _SCORES.items()),
+        ('AUROC / AURC / FPR at 95 % TPR', *_SETS),
+        'failure',
+    ),
+}  # fmt: skip
