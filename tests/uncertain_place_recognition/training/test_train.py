@@ -76,6 +76,10 @@ def test_the_other_roles(runs, tmp_path):
     assert main(['pack', str(teacher), str(tmp_path / 'teacher' / 'best.safetensors'),
                  '--out', str(packed), '--quiet']) == 0  # fmt: skip
     assert EmbeddingEnsemble.load(packed).size == 2
+    several = ['--teacher', str(packed / 'ensemble.safetensors')]
+    assert main(['student', *common, *several, '--seed', '2', '--out', str(tmp_path / 'm')]) == 0
+    assert EmbeddingEnsemble.load(tmp_path / 'm').size == 1
+    assert main(['stun', *common, *several, '--out', str(tmp_path / 'n')]) == 1
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,8 @@ examples:
       one network by triplets; several of them are a naive ensemble, or Mason et al.'s:
   train_place_recognition pack naive/1 naive/2 naive/3 --validation runs/validation --out naive
   train_place_recognition student --teacher shared/teacher --seed 9 ... --out shared/student_9
+  train_place_recognition student --teacher naive/ensemble.safetensors --seed 9 ... --out mean_9
+      the mean of several teachers is learnt, which recognises more than each
   train_place_recognition stun --teacher shared/teacher ... --out stun
   train_place_recognition dropout --rate 0.5 ... --out dropout
   train_place_recognition teacher --preset original --device cuda \\
@@ -96,7 +98,12 @@ def _metric() -> argparse.ArgumentParser:
 
 def _learner() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument('--teacher', type=Path, required=True, help='folder or file of the teacher')
+    parser.add_argument(
+        '--teacher',
+        type=Path,
+        required=True,
+        help='folder or file of the teacher; of several packed ones the mean embedding teaches',
+    )
     return parser
 
 

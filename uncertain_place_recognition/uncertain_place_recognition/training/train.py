@@ -25,6 +25,7 @@ from uncertain_place_recognition.training.arguments import parser
 from uncertain_place_recognition.training.augmentation import AugmentationConfig
 from uncertain_place_recognition.training.embedded_runs import embed_runs, thinned_run
 from uncertain_place_recognition.training.judge import Judge, Judgement
+from uncertain_place_recognition.training.mean_teacher import MeanTeacher
 from uncertain_place_recognition.training.pairs import PairConfig
 from uncertain_place_recognition.training.trainer import Trainer, TrainingConfig
 from uncertain_place_recognition.training.validation import Interchange, interchange
@@ -97,6 +98,8 @@ def _student(
     torch.manual_seed(training.seed)
     network = build(settings)
     if role == 'stun':
+        if isinstance(teacher, MeanTeacher):
+            raise ConfigError('stun begins with the weights of its teacher, which must be one')
         network.load_state_dict(teacher.state_dict(), strict=False)
     return _train(role, network, training, teacher, data, out, arguments)
 
@@ -233,11 +236,12 @@ def _data(arguments: argparse.Namespace) -> _Data:
 
 def _teacher(path: Path) -> tuple[PlaceNetwork, dict[str, Any]]:
     networks, facts = load_networks(path / BEST if path.is_dir() else path)
-    if len(networks) != 1:
-        raise ConfigError(f'{path}: a teacher is one network, this is an ensemble')
+    if len(networks) > 1:
+        # Each has a card of its own; they were trained alike but for the seed.
+        facts = {**facts, **(facts.get('members_trained') or [{}])[0]}
     if 'training' not in facts:
         raise ConfigError(f'{path}: does not say how it was trained; train a teacher first')
-    return networks[0], facts
+    return networks[0] if len(networks) == 1 else MeanTeacher(networks), facts
 
 
 def _postfix(loss: float, active: float, judged: Judgement | None) -> str:
