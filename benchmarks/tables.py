@@ -107,6 +107,8 @@ TABLES: dict[str, Table] = {
             for key, what, asked in (
                 ('ap_sector_45', 'sectors of 45° removed', ''),
                 ('ap_sector_90', 'sectors of 90° removed', '≥ 0.70'),
+                ('ap_rear_70', 'the rear 70° blocked', ''),
+                ('ap_rear_70_aggregated', 'the same, scans aggregated', ''),
                 ('ap_unseen_beams32', 'a sensor unseen in training', ''),
             )
         ),
