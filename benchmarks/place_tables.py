@@ -1,5 +1,7 @@
 """What the tables about place recognition show of benchmarks/results/place_recognition.json."""
 
+from collections.abc import Sequence
+
 from benchmarks.result_table import Cell, Row, Table, WideRow
 
 _SETS = ('town', 'town_far', 'sensor', 'aliased')
@@ -37,30 +39,26 @@ def _exchanged(architecture: str, kind: str) -> WideRow:
     )
 
 
-def _recalled(method: str, what: str) -> WideRow:
+def _on_every_set(what: str, key: str, shown: str, figures: Sequence[str], times: float) -> WideRow:
+    """Return a row with a cell for each test set; `key` has a star for its name."""
     return WideRow(
         what,
         tuple(
-            Cell(
-                '{:.1f} / {:.1f} / {:.1f}',
-                tuple(f'recall.{name}.{method}.{figure}' for figure in ('r1', 'r5', 'r10')),
-                100,
-            )
+            Cell(shown, tuple(f'{key.replace("*", name)}.{one}' for one in figures), times)
             for name in _SETS
         ),
     )
 
 
+def _recalled(method: str, what: str) -> WideRow:
+    return _on_every_set(
+        what, f'recall.*.{method}', '{:.1f} / {:.1f} / {:.1f}', ('r1', 'r5', 'r10'), 100
+    )
+
+
 def _found(score: str, what: str) -> WideRow:
-    return WideRow(
-        what,
-        tuple(
-            Cell(
-                '{:.3f} / {:.3f} / {:.2f}',
-                tuple(f'failure.{name}.{score}.{figure}' for figure in ('auroc', 'aurc', 'fpr95')),
-            )
-            for name in _SETS
-        ),
+    return _on_every_set(
+        what, f'failure.*.{score}', '{:.3f} / {:.3f} / {:.2f}', ('auroc', 'aurc', 'fpr95'), 1
     )
 
 

@@ -25,7 +25,8 @@ class MeanTeacher(PlaceNetwork):
         """
         if not members or any(one.settings != members[0].settings for one in members):
             raise ConfigError(
-                f'teachers must have one shape, got {len(members)} networks of others'
+                f'teachers must have one shape, got {len(members)} networks of '
+                f'{len({one.settings for one in members})} shapes'
             )
         super().__init__(members[0].settings)
         self.members = nn.ModuleList(members)
