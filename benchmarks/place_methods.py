@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.place_sets import ARCHITECTURES, CALIBRATION, SETS, TestSet, embedded, shortened
+from benchmarks.place_sets import (
+    ARCHITECTURES,
+    CALIBRATION,
+    SETS,
+    TestSet,
+    embedded,
+    shortened,
+    trained_for,
+)
 from uncertain_place_recognition.calibration import Calibrated, calibrate
 from uncertain_place_recognition.drift_alarm import DriftAlarm
 from uncertain_place_recognition.embedded_run import EmbeddedRun
@@ -73,6 +81,26 @@ def failures(work: Path, quick: bool = False) -> dict[str, Any]:
     }
     figures['failure_fitted_to'] = {'runs': len(table.runs), 'queries': len(table)}
     return figures
+
+
+def epochs(work: Path, quick: bool = False) -> dict[str, Any]:
+    """Return what students recall, and their doubt is worth, by how long they were trained.
+
+    The thesis halved the epochs (4.2.4): longer training recalls more, and doubts less truly.
+    """
+    figures: dict[str, Any] = {}
+    for batches, architecture in trained_for(MAIN):
+        found = study(embedded('town', _set('town', quick), architecture, work, ('students',)))
+        judged = found.plain()['failure']
+        figures[str(batches)] = {
+            'r1': found.recall['shared'].at[1],
+            'student_r1': found.interchange['students'].diagonal,
+            'off_diagonal_r1': found.interchange['students'].off_diagonal,
+            'u_auroc': judged['shared_u']['auroc'],
+            'u_aurc': judged['shared_u']['aurc'],
+            'distance_auroc': judged['distance']['auroc'],
+        }
+    return {'epochs': {MAIN: figures}}
 
 
 def guarantee(work: Path, quick: bool = False) -> dict[str, Any]:

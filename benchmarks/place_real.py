@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bags.drives import open_drive
+from bags.records import LidarScan
 from benchmarks.loop_pairs import TRUE_PAIR, clouds, kitti_00
 from benchmarks.place_speed import median_ms
 from benchmarks.recordings import folder, karlsruhe_out_and_back
@@ -91,9 +92,22 @@ def one_place() -> dict[str, Any]:
 
 
 def changed_inputs(work: Path, step: int) -> dict[str, Any]:
-    """Return how well uncertainty tells changed sweeps from clean ones (Karlsruhe, AUROC)."""
+    """Return how well doubt tells changed sweeps from clean ones (Karlsruhe, AUROC).
+
+    Uncertainty is u_EV; the probability that the match is wrong is of sweeps asked for in a map of
+    others, clean ones, between them.
+    """
+    drive = open_drive(karlsruhe_out_and_back(work).parents[1])
+    truth = open_drive(karlsruhe_out_and_back(work)).truth()
+    assert truth is not None
+    scans = [one for one in drive.records(kinds=[LidarScan]) if isinstance(one, LidarScan)][::step]
     recognizer = recognizer_of_this()
-    sweeps = list(clouds(karlsruhe_out_and_back(work).parents[1]))[::step]
+    for number, scan in enumerate(scans[1::2]):
+        T_world_base = truth.at(scan.stamp_ns)
+        assert T_world_base is not None
+        recognizer.add(_in_base(scan.cloud), T_world_base, stamp_ns=scan.stamp_ns, id=number)
+    recognizer = _all_searchable(recognizer)
+    asked = [scan.cloud for scan in scans[::2]]
     rng = np.random.default_rng(0)
     views: dict[str, Callable[[PointCloud], PointCloud]] = {
         'clean': lambda cloud: cloud,
@@ -101,15 +115,23 @@ def changed_inputs(work: Path, step: int) -> dict[str, Any]:
         'sector_180': lambda cloud: without_sector(cloud, float(rng.uniform(-3.1, 3.1)), np.pi),
         'sixteen_beams': _sixteen_beams,
     }
-    found = {name: _uncertainties(recognizer, sweeps, view) for name, view in views.items()}
+    found = {name: _doubts(recognizer, asked, view) for name, view in views.items()}
     clean = found.pop('clean')
-    figures: dict[str, Any] = {'sweeps': len(clean), 'clean_uncertainty': float(np.median(clean))}
+    figures: dict[str, Any] = {
+        'sweeps': len(clean),
+        'places': len(recognizer),
+        'clean_uncertainty': float(np.median(clean[:, 0])),
+        'clean_wrong_probability': float(np.median(clean[:, 1])),
+    }
     for name, values in found.items():
         changed = np.r_[np.zeros(len(clean), bool), np.ones(len(values), bool)]
+        uncertainty, wrong = np.r_[clean, values].T
         figures[name] = {
-            'uncertainty': float(np.median(values)),
-            'auroc': auroc(np.r_[clean, values], changed),
-            'too_few_points': len(sweeps) - len(values),
+            'uncertainty': float(np.median(values[:, 0])),
+            'auroc': auroc(uncertainty, changed),
+            'wrong_probability': float(np.median(values[:, 1])),
+            'auroc_of_wrong_probability': auroc(wrong, changed),
+            'too_few_points': len(asked) - len(values),
         }
     return figures
 
@@ -222,15 +244,18 @@ def _draw(
             ax.set_xlabel('travelled [m]')
 
 
-def _uncertainties(
+def _doubts(
     recognizer: PlaceRecognizer, sweeps: list[PointCloud], view: Callable[[PointCloud], PointCloud]
 ) -> NDArray[np.float64]:
+    """Return u_EV and the probability that the match is wrong [N x 2] of sweeps as viewed."""
     found = []
     for cloud in sweeps:
         try:
-            found.append(float(total_uncertainty(recognizer.embed(_in_base(view(cloud))))))
+            answer = recognizer.locate(_in_base(view(cloud)))
         except DataError:
             continue  # too little is left above the ground; counted by the caller
+        assert answer.best is not None and answer.best.false_match_probability is not None
+        found.append((answer.uncertainty_normalised, answer.best.false_match_probability))
     return np.array(found)
 
 

@@ -7,7 +7,8 @@
     python -m benchmarks.place_recognition --work build/places keep runs, embeddings, pictures
 
 PLACE_WEIGHTS names the folder of all trained networks, <architecture>/<role>: minkloc3d and
-pointnetvlad; teacher, students, naive, dropout and stun. PLACE_ENSEMBLE and PLACE_CALIBRATION name
+pointnetvlad; teacher, students, naive, dropout and stun; for the section epochs also
+minkloc3d/epochs/<batches>/students. PLACE_ENSEMBLE and PLACE_CALIBRATION name
 what real and gate use; without, what ships. Runs and embeddings in the work folder are not made
 again: they may come from a machine with a GPU. Exits with 1 when a section failed or a required
 figure is missing.
@@ -77,6 +78,10 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
         'failure': (
             'how well doubts find wrong matches, on the same sets',
             partial(place_methods.failures, quick=quick),
+        ),
+        'epochs': (
+            'recall and doubt of students trained for fewer and for more batches',
+            partial(place_methods.epochs, quick=quick),
         ),
         'guarantee': (
             'promised rates on resplits of runs, and the drift alarm elsewhere',

@@ -78,6 +78,19 @@ def weights(architecture: str) -> dict[str, Path]:
     return found
 
 
+def trained_for(architecture: str) -> list[tuple[int, str]]:
+    """Return of how many batches there are students, and the name that `weights` knows them by.
+
+    They are in $PLACE_WEIGHTS/<architecture>/epochs/<batches>/students.
+    """
+    folder = f'{architecture}/epochs'
+    named = Path(os.environ.get('PLACE_WEIGHTS', '')) / folder
+    counts = sorted(int(path.name) for path in named.glob('*') if path.name.isdecimal())
+    if not counts:
+        raise DataError(f'{named}: expected a folder for each number of batches, e.g. 800/students')
+    return [(count, f'{folder}/{count}') for count in counts]
+
+
 def embedded(
     name: str, chosen: TestSet, architecture: str, work: Path, roles: tuple[str, ...] = ROLES
 ) -> list[EmbeddedRun]:

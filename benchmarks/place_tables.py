@@ -39,6 +39,18 @@ def _exchanged(architecture: str, kind: str) -> WideRow:
     )
 
 
+def _trained_for(batches: int) -> WideRow:
+    figures = f'epochs.minkloc3d.{batches}'
+    recalls = ('r1', 'student_r1', 'off_diagonal_r1')
+    return WideRow(
+        f'{batches}',
+        (
+            *(Cell('{:.1f} %', (f'{figures}.{name}',), 100) for name in recalls),
+            *(Cell('{:.2f}', (f'{figures}.{name}',)) for name in ('u_auroc', 'distance_auroc')),
+        ),
+    )
+
+
 def _on_every_set(what: str, key: str, shown: str, figures: Sequence[str], times: float) -> WideRow:
     """Return a row with a cell for each test set; `key` has a star for its name."""
     return WideRow(
@@ -90,9 +102,14 @@ PLACE_TABLES = {
             ('real.out_and_back.recall_1_of_revisits',), '', 100),
         Row('— answers accepted / of them wrong', '{:.0f} / {:.0f}',
             ('real.out_and_back.accepted', 'real.out_and_back.accepted_wrong')),
-        Row('Uncertainty tells a removed half / sixteen beams from a clean sweep, AUROC',
-            '{:.2f} / {:.2f}', ('real.changed_inputs.sector_180.auroc',
-                                'real.changed_inputs.sixteen_beams.auroc'), '> 0.5'),
+        *(
+            Row(f'{what} tells a removed quarter / half / sixteen beams from clean sweeps, AUROC',
+                '{:.2f} / {:.2f} / {:.2f}',
+                tuple(f'real.changed_inputs.{view}.{figure}'
+                      for view in ('sector_90', 'sector_180', 'sixteen_beams')), '> 0.5')
+            for what, figure in (('Probability of a wrong match', 'auroc_of_wrong_probability'),
+                                 ('— u_EV alone', 'auroc'))
+        ),
         Row('Gate in the aliased district: registrations without / with', '{:.0f} / {:.0f}',
             ('gate.off.registered', 'gate.on.registered')),
         Row('— of them of different places', '{:.0f} / {:.0f}',
@@ -106,6 +123,13 @@ PLACE_TABLES = {
         tuple(_exchanged(one, kind) for one in _ARCHITECTURES for kind in _MEMBERS),
         ('five members', 'searched in their own map', "in another member's", 'by chance'),
         'interchange',
+    ),
+    'place_epochs': Table(
+        'place_recognition',
+        tuple(_trained_for(batches) for batches in (400, 800, 1600)),
+        ('five students of MinkLoc3D, batches', 'ensemble, R@1', 'a student', "in another's map",
+         'AUROC of u_EV', 'of distance'),
+        'epochs',
     ),
     'place_recall': Table(
         'place_recognition',

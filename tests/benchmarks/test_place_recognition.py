@@ -49,6 +49,20 @@ def test_required_figures_are_found_where_sections_put_them(made, tmp_path):
     assert len(made) == 8 and made[-1] == 'aliased_open_set'
 
 
+def test_students_of_shorter_trainings_are_judged_by_their_batches(made, tmp_path, monkeypatch):
+    monkeypatch.setenv('PLACE_WEIGHTS', str(tmp_path))
+    with pytest.raises(DataError, match='a folder for each number of batches'):
+        place_methods.epochs(tmp_path, quick=True)
+    for name in ('800', '1600', 'notes'):
+        (tmp_path / 'minkloc3d' / 'epochs' / name).mkdir(parents=True)
+    found = place_methods.epochs(tmp_path, quick=True)['epochs']['minkloc3d']
+    assert list(found) == ['800', '1600']
+    known = place_methods.exchanged(tmp_path, quick=True)['interchange']['distilled']['minkloc3d']
+    assert found['800']['student_r1'] == known['diagonal_r1']
+    assert found['800']['off_diagonal_r1'] == known['off_diagonal_r1']
+    assert 0.0 <= found['800']['u_auroc'] <= 1.0
+
+
 def test_test_sets_are_large_enough_and_of_towns_nobody_trained_on():
     for chosen in place_sets.SETS.values():
         assert chosen.length_m >= 5000.0 and chosen.runs >= 3

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cmrnet_ekf.networks import cell_flow
 from cmrnet_ekf.networks.config import CmrnetConfig
 from cmrnet_ekf.networks.correlation import correlate
 from cmrnet_ekf.networks.heads import PoseHead
@@ -29,7 +30,7 @@ class Cmrnet(nn.Module):
         s = self.settings = settings.check()
         self.image_pyramid = _pyramid(3, s)
         self.lidar_pyramid = _pyramid(1, s)
-        channels = (2 * s.displacement + 1) ** 2
+        channels = (2 * s.displacement + 1) ** 2 + cell_flow.CHANNELS * bool(s.flow_sharpness)
         self.estimator = nn.ModuleList()
         for width in s.estimator:
             self.estimator.append(_convolution(channels, width))
@@ -62,7 +63,7 @@ class Cmrnet(nn.Module):
             image: [B x 3 x H x W] uint8 RGB (or float, 0..255).
             lidar: [B x H x W] depth in metres, 0 where nothing is seen.
         """
-        return self.features(self.correlation(image, lidar))
+        return self.features(self.correlation(image, lidar), lidar)
 
     def correlation(self, image: Tensor, lidar: Tensor) -> Tensor:
         """Return how alike cells of both are [B x (2d+1)^2 x rows x columns]; see `correlate`."""
@@ -72,9 +73,15 @@ class Cmrnet(nn.Module):
             seen, mapped = _standardised(seen), _standardised(mapped)
         return correlate(seen, mapped, self.settings.displacement)
 
-    def features(self, correlation: Tensor) -> Tensor:
-        """Return features [B x F] of a correlation."""
+    def features(self, correlation: Tensor, lidar: Tensor) -> Tensor:
+        """Return features [B x F] of a correlation and of the LiDAR image that it is of."""
+        s = self.settings
         x = functional.leaky_relu(correlation, _SLOPE)
+        if s.flow_sharpness:
+            flow = cell_flow.cell_flow(
+                correlation, lidar, s.displacement, s.flow_sharpness, s.focal or s.width
+            )
+            x = torch.cat([x, flow.to(x.dtype)], 1)
         for layer in self.estimator:
             x = torch.cat([layer(x), x], 1)
         if self.squeeze is not None:

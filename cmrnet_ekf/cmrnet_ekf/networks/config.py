@@ -1,5 +1,7 @@
 """Shape of the network: CMRNet's and a compact one for two CPU cores."""
 
+from dataclasses import replace
+
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
 
@@ -40,6 +42,12 @@ class CmrnetConfig:
         'a correlation then says how alike cells are from the first batch on',
     )
     displacement: int = setting(4, 'cells that the correlation looks to each side', low=1, high=10)
+    flow_sharpness: float = setting(
+        0.0,
+        'the estimator also sees where a softmax of the correlation times this finds each cell, '
+        'and how far away it is (not in CMRNet); 0: it does not',
+        low=0.0,
+    )
     estimator: tuple[int, ...] = setting(
         (128, 128, 96, 64, 32), 'channels that the layers after the correlation add'
     )
@@ -93,3 +101,5 @@ COMPACT = CmrnetConfig(
     hidden=256,
     branch=64,
 )
+# For the second and third network of a refinement: cells half as large, as guesses are nearer.
+COMPACT_FINE = replace(COMPACT, pyramid=(16, 24, 40), flow_sharpness=10.0)

@@ -18,20 +18,19 @@ def correlate(one: Tensor, other: Tensor, displacement: int) -> Tensor:
         [B x (2d+1)^2 x H x W], row by row from (-d, -d); beyond the border the other map is 0.
     """
     batch, channels, height, width = one.shape
-    padded = functional.pad(other, (displacement,) * 4)
-    # All pairs in one product, then those within reach: quicker than a product for each.
-    pairs = one.flatten(2).transpose(1, 2) @ padded.flatten(2) / channels
-    index = _within_reach(height, width, displacement, one.device)
-    found = pairs.gather(2, index.expand(batch, -1, -1))
-    return found.transpose(1, 2).reshape(batch, -1, height, width)
-
-
-def _within_reach(height: int, width: int, displacement: int, device: torch.device) -> Tensor:
-    """Return the cells [H W x (2d+1)^2] of the padded map around each cell."""
     side = 2 * displacement + 1
-    rows, columns = (
-        torch.arange(count, device=device) for count in (max(height, side), width + side - 1)
-    )
-    cell = rows[:height, None] * len(columns) + columns[:width]
-    shift = rows[:side, None] * len(columns) + columns[:side]
-    return cell.reshape(-1, 1) + shift.reshape(1, -1)
+    padded = functional.pad(other, (displacement,) * 4)
+    # A row of cells with all rows within reach in one product, then the columns within reach:
+    # quicker than a product for each displacement.
+    reach = padded.unfold(2, side, 1).permute(0, 2, 1, 4, 3).reshape(batch * height, channels, -1)
+    row = (one / channels).permute(0, 2, 3, 1).reshape(batch * height, width, channels)
+    index = _within_reach(width, side, one.device)
+    found = (row @ reach).gather(2, index.expand(batch * height, -1, -1))
+    return found.view(batch, height, width, -1).permute(0, 3, 1, 2)
+
+
+def _within_reach(width: int, side: int, device: torch.device) -> Tensor:
+    """Return the cells [W x side^2] around each of a row, in `side` rows of width + side - 1."""
+    down, right = torch.arange(side, device=device), torch.arange(side, device=device)
+    shift = down[:, None] * (width + side - 1) + right
+    return torch.arange(width, device=device)[:, None] + shift.reshape(1, -1)

@@ -11,6 +11,8 @@ from cmrnet_ekf.euler import quaternion_of_euler, wrapped_tensor
 from cmrnet_ekf.networks.outputs import Evidence, GaussianPose, Output, QuaternionPose
 from lcd_common.settings import config, setting
 
+TRANSLATION, ROTATION = slice(0, 3), slice(3, 6)
+
 
 @config
 class LossConfig:
@@ -24,6 +26,16 @@ class LossConfig:
     )
     geometric: bool = setting(True, 'with the geometric loss beside the evidential one')
     density_floor: float = setting(0.04, 'lower densities count as that', low=1e-6)
+    unit_rotation: float = setting(
+        1.0,
+        'in which L^evd measures angles (thesis: radians). Where 1/p stays under 1 the smooth L1 '
+        'of L^D is a square, which is least for a density that is far too wide',
+        unit='rad',
+        low=1e-6,
+    )
+    unit_translation: float = setting(
+        1.0, 'in which L^evd measures translations (thesis: metres)', unit='m', low=1e-6
+    )
     scale_rotation: float = setting(1.0, 's_rot', low=0.0)
     scale_translation: float = setting(1.0, 's_tr', low=0.0)
     matching_weight: float = setting(
@@ -78,8 +90,8 @@ def pose_losses(output: Output, target: Tensor, settings: LossConfig, evidence: 
         uncertain = gaussian_loss(output, error)
         total = shared * (s.scale_translation * translation + s.scale_rotation * rotation)
         return Losses(total + evidence * uncertain, translation, rotation, uncertain)
-    of_t = evidential_loss(output, error, slice(0, 3), s, s.lambda_translation)
-    of_r = evidential_loss(output, error, slice(3, 6), s, s.lambda_rotation)
+    of_t = evidential_loss(output, error, TRANSLATION, s)
+    of_r = evidential_loss(output, error, ROTATION, s)
     total = s.scale_rotation * (shared * rotation + evidence * of_r) + s.scale_translation * (
         shared * translation + evidence * of_t
     )
@@ -121,14 +133,17 @@ def log_density(evidence: Evidence, error: Tensor) -> Tensor:
     )
 
 
-def evidential_loss(
-    evidence: Evidence, error: Tensor, of: slice, settings: LossConfig, weight: float
-) -> Tensor:
-    """Return L^evd (equation 30) of some components, mean of the batch.
+def evidential_loss(evidence: Evidence, error: Tensor, of: slice, settings: LossConfig) -> Tensor:
+    """Return L^evd (equation 30) of the translations or of the rotations, mean of the batch.
 
-    Equations 29, or 28 with `density` log; the distance d of 29 is the smooth L1.
+    Equations 29, or 28 with `density` log; the distance d of 29 is the smooth L1. The density is
+    that per unit of the settings, the distance is in those units.
     """
-    log_p, phi, error = log_density(evidence, error)[:, of], evidence.amount[:, of], error[:, of]
+    turned = of == ROTATION
+    unit = settings.unit_rotation if turned else settings.unit_translation
+    weight = settings.lambda_rotation if turned else settings.lambda_translation
+    log_p, phi = log_density(evidence, error)[:, of] + log(unit), evidence.amount[:, of]
+    error = error[:, of] / unit
     if settings.density == 'log':
         return (-log_p + weight * error.abs() * phi).mean()
     inverse = torch.exp(torch.clamp(-log_p, max=-log(settings.density_floor)))

@@ -164,7 +164,7 @@ class Trainer:
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=s.half):
             correlation = self.network.correlation(batch.image, batch.lidar)
-            output = self.network.head(self.network.features(correlation))
+            output = self.network.head(self.network.features(correlation, batch.lidar))
         evidence = self._loss.evidence_scale(self.step / s.steps)
         losses = pose_losses(output, batch.target, self._loss, evidence)
         matching = self._matching(correlation, batch)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cmrnet_ekf.networks.cmrnet import Cmrnet
-from cmrnet_ekf.networks.config import COMPACT, FULL, CmrnetConfig
+from cmrnet_ekf.networks.config import COMPACT, COMPACT_FINE, FULL, CmrnetConfig
 from cmrnet_ekf.networks.outputs import Evidence, GaussianPose, QuaternionPose
 from lcd_common.errors import ConfigError
 
@@ -91,3 +91,19 @@ def test_shapes_that_do_not_fit_are_refused(broken):
 
 def test_the_full_configuration_is_cmrnets():
     assert CmrnetConfig() == FULL and FULL.grid == (6, 20)
+
+
+def test_the_fine_network_refines_what_the_compact_one_saw():
+    assert COMPACT_FINE.images == COMPACT.images
+    rows, columns = COMPACT.grid
+    assert COMPACT_FINE.grid == (2 * rows, 2 * columns)
+    small = replace(SMALL, flow_sharpness=10.0)
+    network = Cmrnet(small).eval()
+    image = torch.randint(0, 256, (2, 3, 32, 64), dtype=torch.uint8)
+    lidar = 30.0 * torch.rand(2, 32, 64, generator=torch.manual_seed(0))
+    near = network(image, lidar).translation
+    # The same correlation, but another depth.
+    correlation = network.correlation(image, lidar)
+    features = [network.features(correlation, depth) for depth in (lidar, 2.0 * lidar)]
+    assert (features[0] - features[1]).abs().max() > 1e-4
+    assert torch.equal(network.head(features[0]).translation, near)

@@ -8,6 +8,8 @@ import torch
 from scipy import integrate, stats
 
 from cmrnet_ekf.networks.losses import (
+    ROTATION,
+    TRANSLATION,
     LossConfig,
     evidential_loss,
     gaussian_loss,
@@ -57,14 +59,16 @@ def smooth_l1(x):
 
 
 @pytest.mark.parametrize('density', ['inverse', 'log'])
-def test_the_evidential_loss_is_equations_28_to_30(density):
-    m, settings = evidence(1), LossConfig(density=density)
+@pytest.mark.parametrize(('of', 'weight', 'unit'), [(TRANSLATION, 0.1, 0.5), (ROTATION, 0.01, 0.2)])
+def test_the_evidential_loss_is_equations_28_to_30(density, of, weight, unit):
+    m = evidence(1)
+    settings = LossConfig(density=density, unit_translation=0.5, unit_rotation=0.2)
     error = torch.linspace(-1.5, 1.5, 30, dtype=torch.float64).view(5, 6)
-    of, weight = slice(0, 3), 0.1
-    found = evidential_loss(m, error, of, settings, weight)
+    found = evidential_loss(m, error, of, settings)
     nu, alpha, beta = (v.detach().numpy()[:, of] for v in (m.nu, m.alpha, m.beta))
-    e = error.numpy()[:, of]
-    p = stats.t.pdf(e, 2 * alpha, scale=np.sqrt(beta * (1 + nu) / (nu * alpha)))
+    e = error.numpy()[:, of] / unit
+    # Errors in units of `unit` have a density of as many units.
+    p = stats.t.pdf(e, 2 * alpha, scale=np.sqrt(beta * (1 + nu) / (nu * alpha)) / unit)
     if density == 'inverse':
         expected = smooth_l1(1 / np.maximum(p, 0.04)).mean()
         expected += weight * (smooth_l1(e) * (2 * nu + alpha)).mean()
@@ -87,7 +91,8 @@ def test_the_gradients_are_those_of_finite_differences(density):
 
 def test_a_density_below_the_floor_counts_as_the_floor():
     one = Evidence(*(torch.full((1, 6), v) for v in (0.0, 1.0, 2.0, 1e-4)))
-    found = evidential_loss(one, torch.full((1, 6), 50.0), slice(0, 3), LossConfig(), 0.0)
+    settings = LossConfig(lambda_translation=0.0)
+    found = evidential_loss(one, torch.full((1, 6), 50.0), TRANSLATION, settings)
     assert float(found) == pytest.approx(1 / 0.04 - 0.5, rel=1e-5)
     assert torch.isfinite(found)
 

@@ -52,9 +52,10 @@ def test_a_variant_is_trained_goes_on_and_comes_back(tmp_path, sets):
     assert set(result.calibration) == {'x', 'y', 'z', 'roll', 'pitch', 'yaw'}
 
 
+@pytest.mark.parametrize('network', ['compact', 'compact_fine'])
 @pytest.mark.parametrize('name', sorted(VARIANTS))
-def test_each_variant_makes_its_predictor(name):
-    chosen = variant(name, 'compact')
+def test_each_variant_makes_its_predictor(name, network):
+    chosen = variant(name, network)
     kinds = {'plain': 'plain', 'mcd': 'mcd', 'der': 'der', 'nll': 'der', 'covariance': 'covariance'}
     assert Predictor([Cmrnet(chosen.network)]).kind == kinds[name]
 
