@@ -42,6 +42,10 @@ class PoseHead(nn.Module):
                 branch[1].weight *= 0.1
             if self.settings.head == 'quaternion':
                 self.rotation[1].bias[3] = 1.0
+            elif self.settings.head == 'evidential':
+                # beta of angles: a scale of 0.1 rad. Of a scale of 1 rad the density of every
+                # angle lies below the floor of L^D, which then has no gradient.
+                self.rotation[1].bias[9:] = -5.0
             elif self.correlated is not None:
                 self.correlated.weight *= 0.1
 

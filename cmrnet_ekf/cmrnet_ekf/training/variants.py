@@ -13,8 +13,10 @@ NETWORKS: dict[str, tuple[CmrnetConfig, TrainingConfig]] = {
     'compact': (COMPACT, _QUICK),
     'compact_fine': (COMPACT_FINE, _QUICK),
 }
-# Nor for a correlation that finds out by itself what poses tell. Angles are small beside metres.
+# Nor for a correlation that finds out by itself what poses tell. Angles are small beside metres:
+# they weigh more, and evidence is measured in units of about the errors that are left.
 _COMPACT_MATCHING, _COMPACT_ROTATION = 1.0, 5.0
+_COMPACT_UNIT_ROTATION, _COMPACT_UNIT_TRANSLATION = 0.035, 0.5
 VARIANTS = {
     'plain': 'CMRNet; with another --seed, a member of a deep ensemble',
     'mcd': 'dropout of 0.3 on the FC layers, for Monte Carlo sampling',
@@ -49,6 +51,12 @@ def variant(name: str, network: str) -> Variant:
         shape = replace(shape, head='covariance')
     if network != 'full':
         loss = replace(loss, matching_weight=_COMPACT_MATCHING)
-        if shape.head == 'quaternion':
+        if loss.geometric:
             loss = replace(loss, scale_rotation=_COMPACT_ROTATION)
+        if name == 'der':
+            loss = replace(
+                loss,
+                unit_rotation=_COMPACT_UNIT_ROTATION,
+                unit_translation=_COMPACT_UNIT_TRANSLATION,
+            )
     return Variant(shape, training, loss)

@@ -107,3 +107,11 @@ def test_the_fine_network_refines_what_the_compact_one_saw():
     features = [network.features(correlation, depth) for depth in (lidar, 2.0 * lidar)]
     assert (features[0] - features[1]).abs().max() > 1e-4
     assert torch.equal(network.head(features[0]).translation, near)
+
+
+def test_fresh_angles_are_within_what_the_loss_can_see():
+    network = Cmrnet(replace(SMALL, head='evidential'))
+    output = network(torch.zeros(1, 3, 32, 64), torch.full((1, 32, 64), 10.0))
+    scale = output.squared_scale.detach().sqrt()[0]
+    assert (scale[:3] > 0.5).all() and (scale[:3] < 2.0).all()
+    assert (scale[3:] > 0.05).all() and (scale[3:] < 0.2).all()
