@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from uncertain_place_recognition.opened import open_recognizer
 from uncertain_place_recognition.place_recognizer import PlaceRecognizer
 from uncertain_place_recognition.uncertainty import total_uncertainty
 
+if TYPE_CHECKING:
+    from benchmarks.nodes.place_replay import Answers
+
 _MOUNT = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 1.73])
 _SAME_PLACE_M = 25.0
 
@@ -37,9 +40,15 @@ def evaluate(work: Path, step: int = 3) -> dict[str, Any]:
         'kitti_360_one_place': one_place(),
         'changed_inputs': changed_inputs(work, step),
     }
-    # A process of its own: the first odometry of a process decides on KISS-ICP's threads.
-    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
-        figures['out_and_back'] = pool.submit(_through_the_node, work).result()
+    # Processes of their own: the first odometry of a process decides on KISS-ICP's threads.
+    for name, section in (
+        ('out_and_back', _out_and_back),
+        ('kitti_00', _kitti_00),
+        ('kitti_360_one_place', _kitti_360),
+    ):
+        with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
+            found = pool.submit(section, work).result()
+        figures[name] = {**figures.get(name, {}), **found}
     return {'real': figures}
 
 
@@ -143,63 +152,90 @@ def recognizer_of_this() -> PlaceRecognizer:
     )
 
 
-def _through_the_node(work: Path) -> dict[str, Any]:
+def _out_and_back(work: Path) -> dict[str, Any]:
     """Drive the out-and-back recording through odometry and place recognition."""
-    from bags.nodes.lockstep import LockStep
-    from lcd_common.nodes import messages
-    from lcd_common.nodes.parameters import overrides
-    from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
-    from lcd_loop_closure.nodes.offline_slam import own_context
-    from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
-
     drive = open_drive(karlsruhe_out_and_back(work))
     truth = drive.truth()
     assert truth is not None
-    heard: list[Any] = []
-    with own_context() as context:
-        made: dict[str, Any] = {'context': context, 'use_global_arguments': False}
-        ranges = {'max_range': 80.0, 'min_range': 3.0}
-        chosen = {
-            'weights': os.environ.get('PLACE_ENSEMBLE', ''),
-            'calibration': os.environ.get('PLACE_CALIBRATION', ''),
-        }
-        nodes = (
-            LidarOdometryNode(
-                **made, parameter_overrides=overrides(threaded=False, threads=1, **ranges)
-            ),
-            PlaceRecognitionNode(**made, parameter_overrides=overrides(threaded=False, **chosen)),
-        )
-        lockstep = LockStep(nodes)
-        lockstep.listen('/place_matches', heard.append)
-        try:
-            lockstep.run(drive, progress=True)
-            stamp_of = {place.id: place.stamp_ns for place in nodes[1].recognizer.places()}
-        finally:
-            for node in nodes:
-                node.destroy_node()
-    asked = [message for message in heard if message.matches]
-    stamps = [messages.stamp_ns(message.header.stamp) for message in asked]
-    here = np.array([_position(truth, stamp) for stamp in stamps])
-    found = [stamp_of[message.matches[0].place_id] for message in asked]
-    there = np.array([_position(truth, stamp) for stamp in found])
+    answers = _through_the_node(drive, odometry={'max_range': 80.0, 'min_range': 3.0})
+    here, there = (_positions(truth, one) for one in (answers.stamps_ns, answers.found_ns))
     # A place is known where the vehicle was before, except for the last ones (they wait).
-    order = sorted(stamp_of.values())
+    order = answers.places_ns.tolist()
     known = np.array(
-        [_was_here(truth, order, stamp, where) for stamp, where in zip(stamps, here, strict=True)]
+        [
+            _was_here(truth, order, stamp, where)
+            for stamp, where in zip(answers.stamps_ns.tolist(), here, strict=True)
+        ]
     )
     right = np.linalg.norm(here - there, axis=1) <= _SAME_PLACE_M
-    uncertainty = np.array([message.matches[0].uncertainty for message in asked])
-    accepted = np.array([message.matches[0].accepted for message in asked])
+    uncertainty, accepted = answers.uncertainty, answers.accepted
     _draw(here, there, right, known, uncertainty, work / 'pictures' / 'out_and_back.png')
     both = right.any() and not right.all()
     return {
-        'answers': len(asked),
+        'answers': len(right),
         'revisits': int(known.sum()),
         'recall_1_of_revisits': float(right[known].mean()) if known.any() else None,
         'accepted': int(accepted.sum()),
         'accepted_wrong': int((accepted & ~right).sum()),
         'auroc_of_uncertainty': auroc(uncertainty, ~right) if both else None,
     }
+
+
+def _kitti_00(work: Path) -> dict[str, Any]:
+    """Let KITTI 00's scans through the node, with their true poses as odometry."""
+    drive = open_drive(folder() / 'data' / 'kitti_odometry', sequence='00')
+    truth = drive.truth()
+    assert truth is not None
+    poses = dict(zip(truth.stamps_ns.tolist(), truth.T_world_body, strict=True))
+    answers = _through_the_node(drive, poses, places__distance=0.1, recognizer__delay=0)
+    here, there = (_positions(truth, one) for one in (answers.stamps_ns, answers.found_ns))
+    right = np.linalg.norm(here - there, axis=1) <= _SAME_PLACE_M
+    known = np.array(
+        [
+            (np.linalg.norm(_positions(truth, places) - where, axis=1) <= _SAME_PLACE_M).any()
+            for where, places in zip(
+                here,
+                [answers.places_ns[answers.places_ns < stamp] for stamp in answers.stamps_ns],
+                strict=True,
+            )
+        ]
+    )
+    title = 'KITTI 00: scans in order, each asked in the map of those before it'
+    _draw_answers(answers, right, known, title, work / 'pictures' / 'kitti_00.png')
+    query = truth.stamps_ns[TRUE_PAIR[1]]
+    last = np.flatnonzero(answers.stamps_ns == query)
+    return {
+        'through_the_node': len(right),
+        'through_the_node_known': int(known.sum()),
+        'through_the_node_right': int((right & known).sum()),
+        'loop_found_by_the_node': bool(right[last].all()) if len(last) else None,
+    }
+
+
+def _kitti_360(work: Path) -> dict[str, Any]:
+    """Drive KITTI-360's frames, which are one place, through odometry and the node."""
+    drive = open_drive(folder() / 'data' / 'kitti_360')
+    answers = _through_the_node(drive, places__distance=0.5, recognizer__delay=0)
+    right = np.ones(len(answers.stamps_ns), bool)  # one place: whatever is found is right
+    title = 'KITTI-360: frames within 23.5 m are one place'
+    _draw_answers(answers, right, right, title, work / 'pictures' / 'kitti_360.png')
+    return {
+        'through_the_node': len(right),
+        'least_similarity_by_the_node': float(answers.similarity.min()),
+        'accepted_by_the_node': int(answers.accepted.sum()),
+    }
+
+
+def _through_the_node(drive: Any, poses: Any = None, **settings: Any) -> 'Answers':
+    from benchmarks.nodes.place_replay import answers_of
+
+    settings['weights'] = os.environ.get('PLACE_ENSEMBLE', '')
+    settings['calibration'] = os.environ.get('PLACE_CALIBRATION', '')
+    return answers_of(drive, poses, **settings)
+
+
+def _positions(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.reshape([_position(truth, stamp) for stamp in stamps_ns.tolist()], (-1, 2))
 
 
 def _position(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:
@@ -226,7 +262,7 @@ def _draw(
     travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(here, axis=0), axis=1))]
     # There and back on one road: a place is where it lies along the road.
     along = np.linalg.svd(here - here.mean(0), full_matrices=False)[2][0]
-    colours = np.where(right, '#009E73', np.where(known, '#D55E00', '#BBBBBB'))
+    colours = _colours(right, known)
     with figure(path, (13.0, 5.0)) as canvas:
         places, doubts = canvas.subplots(1, 2)
         places.plot(travelled, here @ along, color='#222222', lw=1.2, label='vehicle')
@@ -235,13 +271,45 @@ def _draw(
         places.set_ylabel('position along the road [m]')
         doubts.scatter(travelled, uncertainty, c=colours, s=12)
         doubts.set_title('Uncertainty u')
-        for name, colour in (
-            ('right', '#009E73'), ('wrong', '#D55E00'), ('a place it does not know', '#BBBBBB'),
-        ):  # fmt: skip
-            places.scatter([], [], c=colour, s=12, label=name)
-        places.legend(fontsize=8)
+        _name_colours(places)
         for ax in (places, doubts):
             ax.set_xlabel('travelled [m]')
+
+
+def _draw_answers(
+    answers: 'Answers',
+    right: NDArray[np.bool_],
+    known: NDArray[np.bool_],
+    title: str,
+    path: Path,
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    colours = _colours(right, known)
+    number = np.arange(len(right))
+    with figure(path, (13.0, 4.2)) as canvas:
+        for ax, values, name in zip(
+            canvas.subplots(1, 3),
+            (answers.similarity, answers.uncertainty, answers.wrong_probability),
+            ('Similarity of the best match', 'Uncertainty u', 'Probability that it is wrong'),
+            strict=True,
+        ):
+            ax.scatter(number, values, c=colours, s=22)
+            ax.set_title(name)
+            ax.set_xlabel('scan that was asked')
+        _name_colours(canvas.axes[0])
+        canvas.suptitle(title)
+
+
+def _colours(right: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.str_]:
+    return np.where(right, '#009E73', np.where(known, '#D55E00', '#BBBBBB'))
+
+
+def _name_colours(ax: Any) -> None:
+    for name, colour in (
+        ('right', '#009E73'), ('wrong', '#D55E00'), ('a place it does not know', '#BBBBBB'),
+    ):  # fmt: skip
+        ax.scatter([], [], c=colour, s=12, label=name)
+    ax.legend(fontsize=8)
 
 
 def _doubts(

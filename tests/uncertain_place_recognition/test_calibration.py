@@ -53,6 +53,17 @@ def test_every_query_of_every_run_is_searched_in_the_map_of_the_others(runs, tab
     assert table.wrong[table.known].mean() < 0.5
 
 
+def test_worlds_that_share_a_map_make_it_larger_and_never_right():
+    here, there = ([made_run(n, world=w, submaps=50, noise=0.25) for n in 'abc'] for w in 'xy')
+    alone, shared = (query_table([*here, *there], seed=3, together=t) for t in (False, True))
+    assert alone.database_size == 2 * 50 and shared.database_size == 5 * 50
+    np.testing.assert_array_equal(alone.known, shared.known)
+    # More places that may be taken for the right one: no match comes nearer to being right.
+    assert (shared.wrong >= alone.wrong).all()
+    assert (shared.features[:, 0] <= alone.features[:, 0]).all()
+    assert (shared.features[:, 0] < alone.features[:, 0]).any()
+
+
 @pytest.mark.parametrize('metric', ['cosine', 'euclidean'])
 def test_features_are_those_of_the_running_system(runs, metric):
     from uncertain_place_recognition.evaluation.pairs import PairConfig

@@ -1,7 +1,7 @@
 """Gather what calibration learns from: queries of whole runs, and whether their match was wrong."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +10,8 @@ from lcd_common.errors import DataError
 from uncertain_place_recognition.ambiguity import AmbiguityConfig, match_spread, second_place_ratio
 from uncertain_place_recognition.embedded_run import EmbeddedRun
 from uncertain_place_recognition.evaluation.pairs import JudgedPair, PairConfig, judge_pair
+
+_WORLD_M = 1e6  # between worlds that share a map
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,12 @@ def query_table(
     no_match_share: float = 0.5,
     seed: int = 0,
     ambiguity: AmbiguityConfig | None = None,
+    together: bool = False,
 ) -> QueryTable:
     """Search every run in the map that all other runs of its world make.
+
+    A larger map holds more places that look like a query, so a promise covers maps up to about the
+    calibration's. With `together` the maps of all worlds are one, and the promise covers that size.
 
     Places that the map does not have are what an acceptance must refuse above all, and no drive
     through a mapped town offers them: of a share of queries, drawn, the place is taken out of the
@@ -74,6 +80,7 @@ def query_table(
         no_match_share: of queries without their place.
         seed: of the draw.
         ambiguity: as in use.
+        together: with the runs of all other worlds in the same map, where they are never right.
 
     Raises:
         DataError: no world has two runs, or the embeddings are missing.
@@ -84,6 +91,8 @@ def query_table(
         others = [run for run in runs if run.world == queries.world and run is not queries]
         if not others or not len(queries):
             continue
+        if together:
+            others += _elsewhere(runs, queries.world)
         drawn = np.random.default_rng([seed, number]).random(len(queries))
         judged = judge_pair([one_map(others), queries], (0, 1), 'shared', s, drawn < no_match_share)
         columns.append((feature_rows(judged, s.metric, ambiguity), judged, number))
@@ -127,8 +136,18 @@ def feature_rows(
     )
 
 
+def _elsewhere(runs: Sequence[EmbeddedRun], world: str) -> list[EmbeddedRun]:
+    """Return the runs of all other worlds, each world far from the others."""
+    worlds = sorted({run.world for run in runs} - {world})
+    return [
+        replace(run, positions=run.positions + _WORLD_M * (1 + worlds.index(run.world)))
+        for run in runs
+        if run.world != world
+    ]
+
+
 def one_map(runs: Sequence[EmbeddedRun]) -> EmbeddedRun:
-    """Return runs of one world as one database, with the ensembles that all of them have."""
+    """Return runs as one database of the first one's world, with the ensembles that all of them have."""
     groups = set.intersection(*(set(run.members) for run in runs))
     return EmbeddedRun(
         ' + '.join(run.name for run in runs),
