@@ -63,14 +63,55 @@ def _on_every_set(what: str, key: str, shown: str, figures: Sequence[str], times
 
 
 def _recalled(method: str, what: str) -> WideRow:
-    return _on_every_set(
-        what, f'recall.*.{method}', '{:.1f} / {:.1f} / {:.1f}', ('r1', 'r5', 'r10'), 100
-    )
+    shown = '{:.1f} / {:.1f} / {:.1f}'
+    figures: tuple[str, ...] = ('r1', 'r5', 'r10')
+    if method != 'teacher':
+        shown += ' ({:+.1f} / {:+.1f} / {:+.1f})'
+        figures += tuple(f'{one}_above_teacher' for one in figures)
+    return _on_every_set(what, f'recall.*.{method}', shown, figures, 100)
+
+
+def _euclidean(method: str, what: str) -> WideRow:
+    return _on_every_set(what, f'recall_euclidean.*.{method}', '{:.1f}', ('r1',), 100)
 
 
 def _found(score: str, what: str) -> WideRow:
     return _on_every_set(
         what, f'failure.*.{score}', '{:.3f} / {:.3f} / {:.2f}', ('auroc', 'aurc', 'fpr95'), 1
+    )
+
+
+def _found_more(score: str, what: str) -> WideRow:
+    figures = ('aupr_in', 'aupr_out', 'recall_at_p99')
+    return _on_every_set(what, f'failure.*.{score}', '{:.3f} / {:.3f} / {:.2f}', figures, 1)
+
+
+def _found_unknown(score: str, what: str) -> WideRow:
+    figures = ('auroc', 'auroc_low', 'auroc_high')
+    shown = '{:.3f} ({:.3f} to {:.3f})'
+    return _on_every_set(what, f'failure_open_set.*.{score}', shown, figures, 1)
+
+
+def _searched(size: int) -> WideRow:
+    engines = ('exact', 'compact', 'mason', 'faiss_hnsw')
+    return WideRow(
+        f'{size:,}',
+        tuple(Cell('{:.2f}', (f'query_ms_by_index.{size}.{one}',)) for one in engines),
+    )
+
+
+def _elsewhere(name: str) -> WideRow:
+    figures = f'guarantee.elsewhere.{name}'
+    rates = f'{figures}.target_05'
+    return WideRow(
+        name,
+        (
+            Cell('{:.0f} of {:.0f}', (f'{figures}.runs_with_alarm', f'{figures}.runs')),
+            Cell('{:.1f} %', (f'{figures}.share_under_alarm',), 100),
+            Cell('{:.1f} %', (f'{rates}.ignoring_the_alarm',), 100),
+            Cell('{:.1f} %', (f'{rates}.minding_the_alarm',), 100),
+            Cell('{:.1f} %', (f'{rates}.accepted_right',), 100),
+        ),
     )
 
 
@@ -96,8 +137,10 @@ PLACE_TABLES = {
         ),
         Row('MinkLoc3D embedding / five members', '{:.0f} / {:.0f} ms',
             ('embed_ms', 'five_members_ms'), '≤ 80 / 160 ms'),
-        Row('Query among 18,000 / 1,000,000', '{:.2f} / {:.1f} ms',
-            ('query_ms.18000', 'query_ms.1000000')),
+        Row('Query among 18,000 / 1,000,000: exact, and with eight bits first',
+            '{:.2f} / {:.1f} ms, {:.2f} / {:.1f} ms',
+            tuple(f'query_ms_by_index.{size}.{engine}' for engine in ('exact', 'compact')
+                  for size in (18000, 1000000))),
         Row('Real out-and-back drive: returns recognised first', '{:.0f} %',
             ('real.out_and_back.recall_1_of_revisits',), '', 100),
         Row('— answers accepted / of them wrong', '{:.0f} / {:.0f}',
@@ -142,5 +185,66 @@ PLACE_TABLES = {
         tuple(_found(*one) for one in _SCORES.items()),
         ('AUROC / AURC / FPR at 95 % TPR', *_SETS),
         'failure',
+    ),
+    'place_euclidean': Table(
+        'place_recognition',
+        tuple(_euclidean(*one) for one in _METHODS.items()),
+        ('recall at 1 by Euclidean distance, %', *_SETS),
+        'recall',
+    ),
+    'place_pointnetvlad': Table(
+        'place_recognition',
+        tuple(
+            WideRow(
+                _METHODS[method],
+                (
+                    Cell('{:.1f} / {:.1f} / {:.1f}', tuple(
+                        f'recall_of_others.pointnetvlad.town.{method}.{one}'
+                        for one in ('r1', 'r5', 'r10')), 100),
+                ),
+            )
+            for method in ('student', 'shared', 'naive', 'mason')
+        ),
+        ('PointNetVLAD, recall at 1 / 5 / 10, %', 'town'),
+        'interchange',
+    ),
+    'place_failure_more': Table(
+        'place_recognition',
+        tuple(_found_more(*one) for one in _SCORES.items()),
+        ('AuPR-in / AuPR-out / recall at 99 % precision', *_SETS),
+        'failure',
+    ),
+    'place_open_set': Table(
+        'place_recognition',
+        (*(_found_unknown(*one) for one in _SCORES.items()),
+         _found_unknown('shared_ratio', 'shared space, ratio to the second place alone'),
+         _found_unknown('naive_distance', 'naive ensemble, distance')),
+        ('AUROC, three in ten places unknown', *_SETS),
+        'failure',
+    ),
+    'place_probability': Table(
+        'place_recognition',
+        tuple(
+            _on_every_set(what, f'probability.*{suffix}', '{:.2f} / {:.2f}', ('ece', 'brier'), 1)
+            for what, suffix in (
+                ('all places known', ''), ('three in ten places unknown', '_open_set')
+            )
+        ),
+        ('error of the probability (ECE / Brier)', *_SETS),
+        'failure',
+    ),
+    'place_elsewhere': Table(
+        'place_recognition',
+        tuple(_elsewhere(name) for name in _SETS),
+        ('5 % promised, set', 'runs with alarm', 'queries under alarm', 'wrong ones accepted',
+         'minding the alarm', 'right ones accepted'),
+        'guarantee',
+    ),
+    'place_queries': Table(
+        'place_recognition',
+        tuple(_searched(size) for size in (18_000, 100_000, 1_000_000)),
+        ('a query of 256 numbers, ms; places', 'exact (the node)', 'compact', "five (Mason's)",
+         'faiss HNSW'),
+        'cost',
     ),
 }  # fmt: skip
