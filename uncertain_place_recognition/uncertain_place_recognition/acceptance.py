@@ -238,6 +238,22 @@ def needed(kind: str, target: float, confidence: float = 0.95) -> int:
     return math.ceil(1.0 / a - 1e-9) - 1
 
 
+def available(kind: str, belief: ArrayLike, wrong: ArrayLike, run: ArrayLike) -> int:
+    """Return how many of what `needed` counts the queries [N] of a calibration have.
+
+    Of `precision` these are the right matches above the most believed wrong one: what a threshold
+    can accept without any error.
+    """
+    values, errors = np.asarray(belief, np.float64), np.asarray(wrong, bool)
+    if kind == 'false_match_rate':
+        return int(errors.sum())
+    if kind == 'false_match_rate_by_run':
+        return len(np.unique(np.asarray(run)[errors]))
+    if kind == 'false_accepts':
+        return len(values)
+    return int((values > values[errors].max(initial=-np.inf)).sum())
+
+
 def _binomial(
     values: NDArray[np.float64],
     errors: NDArray[np.bool_],

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lcd_common.command_line import run
-from uncertain_place_recognition.acceptance import KINDS
+from uncertain_place_recognition.acceptance import KINDS, available, needed
 from uncertain_place_recognition.evaluate import RESULTS, add_inputs, results_folder, share
 
 if TYPE_CHECKING:
@@ -93,6 +93,8 @@ def _figures(found: 'Calibrated', table: 'QueryTable') -> dict[str, Any]:
         accepted = one.accepts(belief)
         right = max(int((~held.wrong).sum()), 1)
         shown = {**one.plain(), 'accepted_right': float((accepted & ~held.wrong).sum() / right)}
+        shown['needed'] = needed(one.kind, one.target, one.confidence or 0.95)
+        shown['available'] = available(one.kind, belief, held.wrong, held.run)
         rows.append(shown)
     return {
         'queries': len(table),
@@ -144,10 +146,12 @@ def _text(figures: dict[str, Any]) -> str:
         for one in figures['acceptances']
     ]  # fmt: skip
     text = head + table(['promise', 'target', 'belief above', 'right ones accepted'], rows)
+    text += ''.join(_lacking(one) for one in figures['acceptances'] if one['threshold'] is None)
     if figures['resplits']:
         rows = [
             [
-                one['kind'], f'{100 * one["target"]:g} %', f'{100 * one["observed"]:.2f} %',
+                one['kind'], f'{100 * one["target"]:g} %',
+                '-' if one['observed'] is None else f'{100 * one["observed"]:.2f} %',
                 '-' if one['low'] is None else f'{100 * one["low"]:.2f}-{100 * one["high"]:.2f}',
                 f'{100 * one["accepted_right"]:.1f} %', f'{100 * one["without"]:.0f} %',
             ]
@@ -156,6 +160,24 @@ def _text(figures: dict[str, Any]) -> str:
         header = ['on resplits', 'target', 'observed', '95 %', 'right ones', 'no threshold']
         text += '\n' + table(header, rows)
     return text
+
+
+def _lacking(one: dict[str, Any]) -> str:
+    """Return a line that says what a promise without a threshold lacks."""
+    what, there = {
+        'false_match_rate': ('wrong matches', 'there are'),
+        'false_match_rate_by_run': ('runs with wrong matches', 'there are'),
+        'false_accepts': ('queries', 'there are'),
+        'precision': (
+            'matches accepted without error, more with errors',
+            'above the most believed wrong one lie',
+        ),
+    }[one['kind']]
+    return (
+        f'no threshold for {one["kind"]} of {100 * one["target"]:g} %: it needs at least '
+        f'{one["needed"]} {what}; {there} {one["available"]} in the {one["runs"]} runs that choose '
+        'thresholds\n'
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

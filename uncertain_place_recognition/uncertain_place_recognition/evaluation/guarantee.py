@@ -22,10 +22,12 @@ class Observed:
 
     Attributes:
         kind, target: of the acceptance.
-        observed: mean over resplits of the rate that the kind promises.
+        observed: mean of the rate that the kind promises over resplits that have one; None where
+            none has. Nothing accepted is no precision, no wrong match no rate of false ones.
         low, high: 95 % interval of it over runs (bootstrap); None with fewer than three.
-        exceeded: share of resplits with more than the target.
+        exceeded: share of all resplits with more than the target; what accepts nothing keeps it.
         without: share of resplits in which no threshold could be given.
+        empty: how many resplits have no rate, and are left out of observed and its interval.
         accepted_right: share of right matches that were accepted, mean over resplits.
         accepted: share of all matches that were accepted, mean over resplits.
         queries, no_match, wrong, runs: of all, not of one split.
@@ -34,11 +36,12 @@ class Observed:
 
     kind: str
     target: float
-    observed: float
+    observed: float | None
     low: float | None
     high: float | None
     exceeded: float
     without: float
+    empty: int
     accepted_right: float
     accepted: float
     queries: int
@@ -92,13 +95,12 @@ def observe(
 
 
 class _Counts:
-    """Sums of one acceptance: by run, for the interval, and by resplit, for the mean."""
+    """Sums of one acceptance by resplit and run: for the mean, and for its interval over runs."""
 
     def __init__(self, table: QueryTable) -> None:
         self._table = table
         self._slot = {int(run): k for k, run in enumerate(table.runs)}
-        self._by_run = np.zeros((len(self._slot), 2))
-        self._rates: list[float] = []
+        self._by_run: list[NDArray[np.float64]] = []
         self._accepted: list[tuple[float, float]] = []
         self._missing: list[bool] = []
 
@@ -112,29 +114,42 @@ class _Counts:
             acceptance.kind, wrong
         )
         slot = np.array([self._slot[int(number)] for number in run])
-        np.add.at(self._by_run, slot, np.column_stack([errors, among]).astype(float))
-        self._rates.append(float(errors.sum() / max(among.sum(), 1)))
+        sums = [np.bincount(slot, counted, len(self._slot)) for counted in (errors, among)]
+        self._by_run.append(np.array(sums))
         right = max(int((~wrong).sum()), 1)
         self._accepted.append(((accepted & ~wrong).sum() / right, accepted.mean()))
         self._missing.append(acceptance.threshold is None)
 
     def observed(self, kind: str, target: float) -> Observed:
-        rates, table = np.array(self._rates), self._table
+        table, number = self._table, len(self._slot)
+        rates = self._rates(np.ones((1, number)))[0]
+        has = np.isfinite(rates)
         low, high = self._interval()
         accepted_right, accepted = np.mean(self._accepted, axis=0)
         return Observed(
-            kind, target, float(rates.mean()), low, high, float((rates > target).mean()),
-            float(np.mean(self._missing)), float(accepted_right), float(accepted), len(table),
-            int((~table.known).sum()), int(table.wrong.sum()), len(self._slot), len(rates),
+            kind, target, float(rates[has].mean()) if has.any() else None, low, high,
+            float((rates[has] > target).sum() / len(rates)), float(np.mean(self._missing)),
+            int((~has).sum()), float(accepted_right), float(accepted), len(table),
+            int((~table.known).sum()), int(table.wrong.sum()), number, len(rates),
         )  # fmt: skip
 
+    def _rates(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rate of every resplit [W x S] for weights of runs [W x R]; NaN without one."""
+        errors, among = np.stack(self._by_run, axis=1)
+        counted = weights @ among.T
+        rates = np.full(counted.shape, np.nan)
+        return np.divide(weights @ errors.T, counted, out=rates, where=counted > 0.0)
+
     def _interval(self, draws: int = 2000) -> tuple[float | None, float | None]:
-        number = len(self._by_run)
+        number = len(self._slot)
         if number < 3:
             return None, None
         rng = np.random.default_rng(0)
         drawn = rng.multinomial(number, np.full(number, 1.0 / number), size=draws)
-        errors, among = (drawn @ self._by_run).T
-        rates = errors / np.maximum(among, 1e-12)
-        low, high = np.quantile(rates, [0.025, 0.975])
+        # Of the same mean that is observed: pooled rates would lie elsewhere where resplits differ.
+        rates = self._rates(drawn.astype(float))
+        rates = rates[np.isfinite(rates).any(axis=1)]
+        if not len(rates):
+            return None, None
+        low, high = np.quantile(np.nanmean(rates, axis=1), [0.025, 0.975])
         return float(low), float(high)
