@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, Imu
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from bags.nodes.lockstep import LockStep
@@ -27,6 +29,7 @@ from cmrnet_ekf.nodes.camera_messages import (
     image_from_message,
     image_message,
 )
+from cmrnet_ekf.nodes.ekf_node import EkfNode
 from cmrnet_ekf.nodes.map_registration_node import MapRegistrationNode
 from cmrnet_ekf.overlay import colours, overlay
 from cmrnet_ekf.pose_belief import PoseBelief
@@ -76,11 +79,15 @@ class Fed:
         self.lockstep.listen('/camera_pose/overlay', self.overlays.append)
 
     def mount(self) -> None:
-        transform = TransformStamped(
-            header=messages.header(START_NS, 'base_link'), child_frame_id='camera'
-        )
-        transform.transform = messages.transform_message(T_BASE_CAMERA)
-        self.lockstep.feed('/tf_static', TFMessage(transforms=[transform]))
+        mounts = [
+            TransformStamped(
+                header=messages.header(START_NS, 'base_link'),
+                child_frame_id=child,
+                transform=messages.transform_message(T),
+            )
+            for child, T in (('camera', T_BASE_CAMERA), ('imu', np.eye(4)))
+        ]
+        self.lockstep.feed('/tf_static', TFMessage(transforms=mounts))
 
     def info(self, step: int, **changes: Any) -> None:
         info = CameraInfo(header=messages.header(START_NS + step * 10**8, 'camera'))
@@ -100,8 +107,22 @@ class Fed:
         odometry.pose = messages.pose_with_covariance(T, np.eye(6) * deviation**2)
         self.lockstep.feed('/odometry/filtered', odometry)
 
+    def stand(self, first: int, last: int) -> None:
+        """Feed ten samples of an IMU that stands, and an image, for each step."""
+        for sample in range(10 * first + 1, 10 * last + 1):
+            imu = Imu(header=messages.header(START_NS + sample * 10**7, 'imu'))
+            imu.linear_acceleration = Vector3(z=9.81)
+            self.lockstep.feed('/imu', imu)
+            if sample % 10 == 0:
+                self.image(sample // 10)
+
     def counted(self, cause: str) -> int:
         return self.node.diagnostics.counted(cause)
+
+    def warning(self) -> str:
+        status = self.node.diagnostics.status()
+        assert (status.level == DiagnosticStatus.OK) == (status.message == 'ok')
+        return str(status.message)
 
 
 @pytest.fixture
@@ -184,6 +205,76 @@ def test_what_cannot_be_used_is_counted(told: Callable[..., Fed]) -> None:
     fed.predict(5.5, se3.inverse(at(5.0)))
     assert fed.counted('rejected images: no map in sight') >= 1
     assert not fed.poses
+
+
+def test_diagnostics_warn_while_images_come_in_vain(told: Callable[..., Fed]) -> None:
+    fed = told()
+    fed.mount()
+    fed.image(1)
+    assert 'images come, but no usable camera_info' in fed.warning()
+    fed.info(1)
+    assert fed.warning() == 'ok'
+    for step in (2, 3, 4):
+        fed.image(step)
+    assert fed.warning() == 'ok', 'they may wait'
+    fed.image(5)
+    assert 'initialpose' in fed.warning() and 'no prediction' in fed.warning()
+    fed.predict(5.0, at(5.0), deviation=4.0)
+    assert 'off by 4.0 m, too uncertain' in fed.warning() and 'no pred' not in fed.warning()
+    fed.predict(6.0, at(5.0))
+    fed.image(6)
+    assert fed.warning() == 'ok' and len(fed.poses) == 1
+    fed.image(7)
+    fed.predict(9.0, at(5.0))
+    assert 'max_prediction_gap' in fed.warning()
+    fed.image(8)
+    fed.predict(9.5, at(5.0))
+    assert 'max_prediction_gap' in fed.warning()
+    fed.image(10)
+    fed.predict(10.0, at(5.0))
+    assert fed.warning() == 'ok' and len(fed.poses) == 2
+
+
+def test_beside_ekf_images_are_refined_once_somebody_says_where_it_is(
+    told: Callable[..., Fed], make: Callable[..., Any], monkeypatch: Any
+) -> None:
+    fed = told()
+    ekf = make(
+        EkfNode, odometry='', fixes='', start_from='set_pose', frozen_imu=0, publish_rate=0.0
+    )
+    fed.lockstep.add(ekf)
+    predicted: list[np.ndarray] = []
+    fed.lockstep.listen(
+        '/odometry/filtered',
+        lambda message: predicted.append(messages.transform_from_pose(message.pose.pose)),
+    )
+    T_base_body = T_BASE_CAMERA @ T_OPTICAL_BODY
+
+    def knows(self: Predictor, image: Any, lidar: Any) -> PoseBelief:
+        T_guess_true = se3.inverse(predicted[-1] @ T_base_body) @ at(5.0) @ T_base_body
+        return PoseBelief(
+            euler.components(T_guess_true)[None], SCALE, np.full((1, 6), np.inf), SCALE**2
+        )
+
+    monkeypatch.setattr(Predictor, 'belief', knows)
+    fed.mount()
+    fed.info(0)
+    fed.stand(0, 5)
+    assert not fed.poses and not predicted
+    assert 'start ekf by initialpose' in fed.warning()
+    start = PoseWithCovarianceStamped(header=messages.header(START_NS + 5 * 10**8, 'map'))
+    start.pose = messages.pose_with_covariance(at(5.8), None)
+    fed.lockstep.feed('/initialpose', start)
+    fed.stand(5, 20)
+    assert fed.warning() == 'ok'
+    assert len(fed.poses) >= 15
+    assert ekf.diagnostics.counted('camera accepted') == len(fed.poses)
+    assert se3.distance(predicted[-1], at(5.0))[0] < 0.2
+    # What ekf forgets, somebody has to say again.
+    ekf.on_reset(Trigger.Request(), Trigger.Response())
+    fed.poses.clear()
+    fed.stand(20, 25)
+    assert not fed.poses and 'start ekf by initialpose' in fed.warning()
 
 
 def test_estimates_that_are_too_uncertain_are_rejected(told: Callable[..., Fed]) -> None:

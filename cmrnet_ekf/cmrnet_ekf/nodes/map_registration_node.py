@@ -12,7 +12,10 @@ Publishes   camera_pose (geometry_msgs/PoseWithCovarianceStamped of base_link in
 
 An image waits for the prediction at its stamp. While one is worked on, only the newest waits.
 Predictions that are too uncertain (max_deviation), that look where there is no map, or that the
-network's uncertainty marks as failures (max_trace) are counted and not published.
+network's uncertainty marks as failures (max_trace) are counted and not published. While images
+come that cannot be refined at all (no calibration, no prediction, a prediction that is too
+uncertain), the diagnostics warn and say what is missing: ekf has a prediction only once somebody
+told it where the vehicle is (initialpose or ~/set_pose).
 """
 
 from dataclasses import dataclass
@@ -45,9 +48,15 @@ from lcd_common.nodes.spin import run_node
 from lcd_common.nodes.transforms import StaticTransforms
 from lcd_common.nodes.worker import Worker
 from lcd_common.settings import config, setting
-from lcd_common.stamp_buffer import StampBuffer, StampedPose
+from lcd_common.stamp_buffer import StampBuffer, StampedPose, Unpaired
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
+
+_NO_PREDICTION = {
+    Unpaired.BUFFER_FULL: 'odometry/filtered is silent; start ekf by initialpose or ~/set_pose',
+    Unpaired.TOO_OLD: 'they are older than odometry/filtered, or it came too late',
+    Unpaired.GAP: 'odometry/filtered has gaps longer than max_prediction_gap',
+}
 
 
 @config
@@ -165,6 +174,7 @@ class MapRegistrationNode(Node):
                 camera = camera_from_message(message)
                 self._localizer = CameraLocalizer(camera, T_base_camera, self._stages)
                 self._calibrated_by = message
+                self.diagnostics.warn('calibration', None)
             except DataError as error:
                 problem = str(error)
                 self._reject('camera_info', 'unusable', problem)
@@ -177,7 +187,9 @@ class MapRegistrationNode(Node):
             return
         self.diagnostics.tick('images', stamp_ns)
         if self._localizer is None:
-            self._reject('images', 'no calibration', 'images come, but no usable camera_info')
+            text = 'images come, but no usable camera_info: no poses'
+            self._reject('images', 'no calibration', text)
+            self.diagnostics.warn('calibration', text)
             return
         self._pair(self._buffer.add_item(stamp_ns, message))
 
@@ -204,7 +216,12 @@ class MapRegistrationNode(Node):
     def _pair(self, paired: list[Any]) -> None:
         for _, why in self._buffer.unpaired:
             self.diagnostics.count(f'rejected images: no prediction ({why.value})')
+            text = f'images come, but no prediction for them: {_NO_PREDICTION[why]}'
+            self.diagnostics.warn('prediction', text)
+            self.get_logger().warning(text, throttle_duration_sec=5.0)
         self._buffer.unpaired.clear()
+        if paired:
+            self.diagnostics.warn('prediction', None)
         for pair in paired:
             assert self._localizer is not None
             self._jobs.put(
@@ -214,9 +231,14 @@ class MapRegistrationNode(Node):
     def _locate(self, job: _Job) -> None:
         limit = self.config.max_deviation
         if 0 < limit < job.deviation_m:
-            text = f'the prediction may be off by {job.deviation_m:.1f} m: too uncertain to refine'
+            text = (
+                f'the prediction may be off by {job.deviation_m:.1f} m, too uncertain to refine '
+                f'(max_deviation {limit:g} m): tell ekf where the vehicle is (initialpose)'
+            )
             self._reject('images', 'prediction too uncertain', text)
+            self.diagnostics.warn('uncertain', text)
             return
+        self.diagnostics.warn('uncertain', None)
         with self.diagnostics.stage('image'):
             try:
                 pixels = image_from_message(job.image)
