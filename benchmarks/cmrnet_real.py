@@ -24,14 +24,13 @@ from cmrnet_ekf.mapping.map_builder import MapBuilder
 from cmrnet_ekf.mapping.settings import MapConfig
 from cmrnet_ekf.mapping.tile_folder import TileFolder
 from cmrnet_ekf.networks.cmrnet import Cmrnet
-from cmrnet_ekf.networks.losses import LossConfig
 from cmrnet_ekf.overlay import overlay
 from cmrnet_ekf.pose_sampling import STAGES, T_OPTICAL_BODY
 from cmrnet_ekf.predictors import Predictor
 from cmrnet_ekf.training.sample_maker import SamplesConfig, make_samples
 from cmrnet_ekf.training.sample_set import SampleSet
 from cmrnet_ekf.training.trainer import Trainer
-from cmrnet_ekf.training.variants import NETWORKS
+from cmrnet_ekf.training.variants import NETWORKS, variant
 from lcd_common import se3
 from lcd_common.trajectory import Trajectory
 from lcd_loop_closure.lidar_odometry import LidarOdometry
@@ -126,11 +125,10 @@ def fine_tuned(out: Path, network: Cmrnet, learnt: SampleSet, steps: int) -> Pre
     copy = Cmrnet(network.settings)
     copy.load_state_dict(network.state_dict())
     settings = replace(NETWORKS['compact'][1], steps=steps, learning_rate=1e-4)
+    loss = variant('der', 'compact').loss
     # The second of the thesis's two steps: this is the end of a training.
-    loss = LossConfig()
-    trainer = Trainer(
-        copy, [learnt], out, settings, replace(loss, evidence_first=loss.evidence_second)
-    )
+    loss = replace(loss, evidence_first=loss.evidence_second)
+    trainer = Trainer(copy, [learnt], out, settings, loss)
     for _ in tqdm(trainer.run(), 'fine-tuning', steps, initial=trainer.step):
         pass
     return Predictor([copy])

@@ -4,7 +4,11 @@ from benchmarks.result_table import Cell, Row, Table, WideRow
 
 _WAYS = {'rough': 'the guesses', 'cmrnet': 'CMRNet', 'mcd': 'MC dropout', 'de': 'deep ensemble',
          'der': 'evidential regression'}  # fmt: skip
-_UNCERTAIN = ('mcd', 'de', 'der')
+_OF_UNCERTAIN = {way: _WAYS[way] for way in ('mcd', 'de', 'der')}
+_LOSSES = {'der_thesis': "thesis's L^D, in metres and radians", 'nll': 'negative log-likelihood',
+           'covariance': 'Gaussian, full covariance'}  # fmt: skip
+_UNCERTAIN = (*_OF_UNCERTAIN, *_LOSSES)
+_REFINED = {way: _WAYS[way] for way in ('cmrnet', 'der')}
 _TRACKED = {
     'motion': 'motion model alone',
     'unfiltered': 'CMRNet without a filter',
@@ -34,6 +38,59 @@ def _localized(way: str, what: str) -> WideRow:
     )
 
 
+def _calibrated(way: str, what: str) -> WideRow:
+    errors = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+    return WideRow(
+        what,
+        (
+            *(Cell('{:.3f}', (f'calibration.{way}.{axis}',)) for axis in errors),
+            Cell('{:.2f}', (f'calibration.ause.{way}.translation',)),
+        ),
+    )
+
+
+def _rejected(way: str, what: str) -> WideRow:
+    kept = f'rejection.{way}'
+    return WideRow(
+        what,
+        (
+            Cell('{:.2f} m', (f'localization.{way}.t_mean_m',)),
+            Cell('{:.2f} m', (f'{kept}.t_mean_m',)),
+            Cell('{:.2f}°', (f'localization.{way}.r_mean_deg',)),
+            Cell('{:.2f}°', (f'{kept}.r_mean_deg',)),
+            Cell('{:.1f} %', (f'{kept}.discarded_share',), 100),
+        ),
+    )
+
+
+def _refined(way: str, what: str) -> WideRow:
+    stages = (f'localization.{way}', f'localization.refined.{way}.after_stage_2')
+    return WideRow(
+        what,
+        tuple(
+            Cell('{:.2f} m, {:.2f}°', (f'{stage}.t_median_m', f'{stage}.r_median_deg'))
+            for stage in stages
+        ),
+    )
+
+
+def _held(way: str, what: str, of: str = 'ekf') -> WideRow:
+    figures = f'{of}.{way}'
+    return WideRow(
+        what,
+        (
+            *(
+                Cell('{:.2f}' + unit, (f'{figures}.{key}',))
+                for key, unit in (
+                    ('t_median_m', ' m'), ('t_mean_m', ' m'), ('t_max_m', ' m'),
+                    ('r_median_deg', '°'),
+                )
+            ),
+            Cell('{:.0f} of {:.0f}', (f'{figures}.diverged', f'{figures}.runs')),
+        ),
+    )  # fmt: skip
+
+
 LOCALIZATION_TABLES = {
     'cmrnet': Table(
         'cmrnet_ekf',
@@ -42,16 +99,38 @@ LOCALIZATION_TABLES = {
          'calibration error x / y / yaw', 'mean error when the unsure are rejected'),
         'localization',
     ),
+    'cmrnet_losses': Table(
+        'cmrnet_ekf',
+        tuple(_localized(*way) for way in _LOSSES.items()),
+        ('Table 5.2, single pass', 'error, median / mean', 'rotation', 'off by more than 1 m',
+         'calibration error x / y / yaw', 'mean error when the unsure are rejected'),
+        'localization',
+    ),
+    'cmrnet_calibration': Table(
+        'cmrnet_ekf',
+        tuple(_calibrated(*way) for way in {**_OF_UNCERTAIN, **_LOSSES}.items()),
+        ('calibration error', 'x', 'y', 'z', 'roll', 'pitch', 'yaw', 'AUSE of translation'),
+        'calibration',
+    ),
+    'cmrnet_rejection': Table(
+        'cmrnet_ekf',
+        tuple(_rejected(*way) for way in _OF_UNCERTAIN.items()),
+        ('the most uncertain rejected', 'mean error', 'of those kept', 'rotation, mean',
+         'of those kept', 'discarded'),
+        'rejection',
+    ),
+    'cmrnet_refined': Table(
+        'cmrnet_ekf',
+        tuple(_refined(*way) for way in _REFINED.items()),
+        ('in stages, median', 'single pass', 'and the second network'),
+        'localization',
+    ),
     'tracking': Table(
         'cmrnet_ekf',
-        tuple(
-            WideRow(what, tuple(
-                Cell('{:.2f}' + unit, (f'ekf.{way}.{key}',))
-                for key, unit in (('t_median_m', ' m'), ('t_mean_m', ' m'), ('t_max_m', ' m'),
-                                  ('r_median_deg', '°'))))
-            for way, what in _TRACKED.items()
-        ),
-        ('closed loop', 'median', 'mean', 'largest', 'rotation, median'),
+        (*(_held(*way) for way in _TRACKED.items()),
+         *(_held(way, f'in two stages: {_TRACKED[way]}', 'ekf.refined')
+           for way in ('unfiltered', 'der'))),
+        ('closed loop', 'median', 'mean', 'largest', 'rotation, median', 'lost'),
         'ekf',
     ),
     'ekf': Table('cmrnet_ekf', (
@@ -74,7 +153,10 @@ LOCALIZATION_TABLES = {
                   for key in ('rough', 'der_before', 'der_after'))),
         Row('IMU samples a second', '{:,.0f}', ('imu_hz',), '≥ 10,000'),
         Row('LiDAR image of 700,000 points', '{:.0f} ms', ('lidar_image_ms',), '≤ 60 ms'),
+        Row('— share of its pixels filled, before occlusion', '{:.0f} %',
+            ('speed_conditions.fill',), '', 100),
         Row('Compact CMRNet with DER, steps a second', '{:.0f}', ('step_hz.compact_cpu',), '≥ 5'),
+        Row('Peak memory of such a step', '{:.0f} MB', ('peak_memory_mb.compact_step',)),
         Row('30 draws of MC dropout, beside one pass', '{:.2f} ×', ('mcd_cost_ratio',), '≤ 1.3 ×'),
     )),
 }  # fmt: skip
