@@ -84,3 +84,22 @@ def test_a_second_authority_is_noticed_and_the_own_echo_is_not(node: Node) -> No
     assert authority.rivals == 1
     authority.on_tf(TFMessage(transforms=[edge('map', 'odom', T, 6)]))
     assert authority.rivals == 2
+
+
+def test_another_parent_of_the_child_is_noticed(node: Node) -> None:
+    authority = TransformAuthority(node, 'map', 'base_link')
+    T = se3.rotation_z(0.1)
+    authority.send(T, 5)
+    authority.on_tf(
+        TFMessage(
+            transforms=[
+                edge('/map', '/base_link', T, 5),
+                edge('base_link', 'wheel', T, 5),
+                edge('map', 'odom', T, 5),
+                edge('map', 'base_link_front', T, 5),
+            ]
+        )
+    )
+    assert authority.rivals == 0
+    authority.on_tf(TFMessage(transforms=[edge('odom', 'base_link', T, 5)]))
+    assert authority.rivals == 1, 'equal numbers are no excuse: odom is no map'

@@ -1,7 +1,5 @@
 """Follow /tf_static and broadcast transforms with nothing but the standard message."""
 
-from collections.abc import Iterable
-
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -10,7 +8,12 @@ from tf2_msgs.msg import TFMessage
 from lcd_common import se3
 from lcd_common.errors import DataError
 from lcd_common.nodes import qos
-from lcd_common.nodes.messages import header, transform_from_message, transform_message
+from lcd_common.nodes.messages import (
+    header,
+    stamp_ns,
+    transform_from_message,
+    transform_message,
+)
 
 
 class StaticTransforms:
@@ -55,7 +58,11 @@ class StaticTransforms:
 
 
 class TransformAuthority:
-    """Broadcast one edge of the tree on /tf and notice when somebody else does too."""
+    """Broadcast one edge of the tree on /tf and notice when somebody else moves its child too.
+
+    A frame has one parent: the same edge from another node is a rival, and so is another parent of
+    the child, between which tf would jump.
+    """
 
     def __init__(self, node: Node, parent: str, child: str) -> None:
         self.parent, self.child = parent, child
@@ -78,24 +85,21 @@ class TransformAuthority:
         self._publisher.publish(TFMessage(transforms=[stamped]))
 
     def on_tf(self, message: TFMessage) -> None:
-        """Count the transforms of the same edge that are not this node's own."""
-        for stamped in self._edges(message.transforms):
-            stamp = stamped.header.stamp.sec * 1_000_000_000 + stamped.header.stamp.nanosec
-            if self._sent.get(stamp) == _digits(stamped):
+        """Count the transforms to the same child that are not this node's own."""
+        for stamped in message.transforms:
+            if stamped.child_frame_id.lstrip('/') != self.child.lstrip('/'):
+                continue
+            parent = stamped.header.frame_id.lstrip('/')
+            same = parent == self.parent.lstrip('/')
+            if same and self._sent.get(stamp_ns(stamped.header.stamp)) == _digits(stamped):
                 continue
             self.rivals += 1
+            text = 'two authorities' if same else f'two parents, {parent} and {self.parent},'
             self._log.error(
-                f'another node publishes {self.parent} -> {self.child} on /tf: two authorities '
-                'make the vehicle jump; set publish_tf:=false on one of them',
+                f'another node publishes {parent} -> {self.child} on /tf: {text} make the vehicle '
+                'jump; let one of them own it (publish_tf:=false, or tf:=none of ekf)',
                 throttle_duration_sec=10.0,
             )
-
-    def _edges(self, transforms: Iterable[TransformStamped]) -> Iterable[TransformStamped]:
-        return (
-            t
-            for t in transforms
-            if t.header.frame_id == self.parent and t.child_frame_id == self.child
-        )
 
 
 def _digits(stamped: TransformStamped) -> bytes:
