@@ -48,6 +48,19 @@ def test_a_calibration_is_written_for_every_target(calibrated):
     assert (calibrated / 'calibration.png').stat().st_size > 10_000
 
 
+@pytest.mark.parametrize(('apart', 'size'), [([], 5 * 50), (['--apart'], 2 * 50)])
+def test_worlds_share_the_map_that_a_promise_covers_unless_apart(tmp_path, apart, size):
+    for name in 'abcdef':
+        run = made_run(name, world='xy'['def'.count(name)], submaps=50, noise=0.3)
+        facts = {'weights': {'students': 'a hash'}}
+        EmbeddedRun(run.name, run.world, run.stamps_ns, run.positions, run.members, facts).save(
+            tmp_path / 'runs' / f'{name}.npz'
+        )
+    out = tmp_path / 'out'
+    assert calibrate.main([str(tmp_path / 'runs'), '--out', str(out), '--quiet', *apart]) == 0
+    assert Calibration.load(out / 'calibration.json').acceptance.database_size == size
+
+
 def test_the_names_of_files_tell_the_target():
     assert [calibrate._percent(t) for t in (0.01, 0.05, 0.1, 0.001)] == ['01', '05', '10', '001']
 

@@ -23,10 +23,12 @@ examples:
       --target 0.05 --kind false_match_rate_by_run
   calibrate_place_recognition embedded/calibration --out weights/calibrated --resplits 100
 
-Every run is searched in the map that all other runs of its world make; of a share of the queries
-(--no-match) the place is taken out of that map first, because places that are not in the map are
-what must be refused. A third of the runs teaches the probability that a match is wrong; the others
-choose the threshold for each target.
+Every run is searched in the map that all other runs make, those of other worlds included: a
+promise covers maps up to a tenth larger than that (--apart: only those of its world). Of a share of
+the queries (--no-match) the place is taken out of that map first, because places that are not in
+the map are what must be refused. Keep the places of the map as far apart as the submaps here. A
+third of the runs teaches the probability that a match is wrong; the others choose the
+threshold for each target.
 
 kinds of promises, and what they need for 1 % (5 %):
   false_match_rate         P(accepted | wrong) on average: 99 (19) wrong matches
@@ -61,7 +63,9 @@ def _run(arguments: argparse.Namespace) -> None:
     settings = PairConfig(
         radius=arguments.radius, excluded=2.0 * arguments.radius, metric=arguments.metric
     )
-    table = query_table(runs, settings, arguments.no_match, arguments.seed)
+    table = query_table(
+        runs, settings, arguments.no_match, arguments.seed, together=not arguments.apart
+    )
     targets = sorted({*TARGETS, arguments.target})
     found = calibrate(table, targets, confidence=arguments.confidence, seed=arguments.seed)
     observed = []
@@ -199,6 +203,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--no-match', type=share, default=0.5, metavar='SHARE',
         help='queries whose place is taken out of the map (0.5)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--apart', action='store_true',
+        help='each world has a map of its own (default: all share one, and the promise covers it)',
     )  # fmt: skip
     parser.add_argument(
         '--resplits', type=int, default=0, metavar='N',
