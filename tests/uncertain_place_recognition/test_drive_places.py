@@ -8,7 +8,7 @@ from lcd_common import se3
 from lcd_common.stamp_buffer import StampedPose
 from lcd_loop_closure.radius_search import GraphPositions
 from lcd_loop_closure.reduction import ReductionConfig
-from uncertain_place_recognition.drive_places import DrivePlaces
+from uncertain_place_recognition.drive_places import DrivePlaces, PlaceSpacingConfig
 from uncertain_place_recognition.keyframe_poses import KeyframePoses
 from uncertain_place_recognition.place import Place
 from uncertain_place_recognition.scan_keyframes import KeyframeStamp, ScanKeyframes
@@ -103,6 +103,17 @@ def test_a_session_that_starts_again_is_noticed():
     add(places, made, 1, keyframe=5)
     assert [p.id for p in made.places()] == [4, 5]
     assert places.starts_again(0) and places.starts_again(5) and not places.starts_again(6)
+
+
+def test_keyframes_nearer_than_the_spacing_are_no_places_but_keep_their_poses():
+    made = recognizer()
+    places = drive(made, spacing=PlaceSpacingConfig(distance=45.0))  # of places 30 m apart
+    added = [add(places, made, number, keyframe=number) for number in range(4)]
+    assert added == [True, False, True, False]
+    np.testing.assert_array_equal(places.T_map_base(np.eye(4), 1), pose_of(1))
+    places.force_next = True
+    assert add(places, made, 4, keyframe=4)
+    assert not add(places, made, 5, keyframe=5)
 
 
 def test_scans_and_keyframes_meet_in_any_order():

@@ -7,13 +7,31 @@ from numpy.typing import NDArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
+from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import StampedPose
+from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
 from lcd_loop_closure.radius_search import GraphPositions
 from lcd_loop_closure.reduction import ReductionConfig
 from uncertain_place_recognition.keyframe_poses import KeyframePoses
 from uncertain_place_recognition.place import PlaceAnswer
 from uncertain_place_recognition.place_recognizer import PlaceRecognizer
 from uncertain_place_recognition.relocalizer import Relocalized, Relocalizer, RelocalizerConfig
+
+
+@config
+class PlaceSpacingConfig:
+    """How far apart places are: as the submaps of the calibration, or its promises do not fit.
+
+    What speaks against a match is told from the ten best, and in a denser map all ten are of one
+    place.
+    """
+
+    distance: float = setting(10.0, 'travelled distance between places', unit='m', low=0.1)
+    angle: float = setting(0.5, 'turned angle between places', unit='rad', low=0.01, high=3.15)
+
+    def selector(self) -> KeyframeSelector:
+        """Return what chooses scans by it."""
+        return KeyframeSelector(KeyframeConfig(self.distance, self.angle))
 
 
 class DrivePlaces:
@@ -31,8 +49,12 @@ class DrivePlaces:
         reduction: ReductionConfig,
         *,
         by_keyframes: bool,
+        spacing: PlaceSpacingConfig | None = None,
     ) -> None:
-        """Begin a drive in the recognizer's map; with `relocalizer` look for the vehicle in it."""
+        """Begin a drive in the recognizer's map; with `relocalizer` look for the vehicle in it.
+
+        With `spacing` scans nearer to the last place are not remembered, whoever chose them.
+        """
         self._recognizer, self._reduction = recognizer, reduction
         self._by_keyframes = by_keyframes
         loaded = recognizer.places()
@@ -45,6 +67,7 @@ class DrivePlaces:
         self._relocalizer: Relocalizer | None = None
         self._newest_id = -1
         self._lock = threading.Lock()
+        self._spacing = None if spacing is None else spacing.selector()
         self.force_next = False
 
     @property
@@ -87,15 +110,22 @@ class DrivePlaces:
         pose: StampedPose,
         keyframe_id: int | None,
     ) -> bool:
-        """Remember a scan as a place; False when nobody knows where in the map it is.
+        """Remember a scan as a place.
+
+        Returns:
+            False when nobody knows where in the map it is, or when it is too near to the last one.
 
         Raises:
             DataError: the keyframe's number is taken.
         """
-        self.force_next = False
+        forced, self.force_next = self.force_next, False
         T_map_base = self._place(pose, keyframe_id)
         if T_map_base is None:
             return False
+        if self._spacing is not None:
+            if not (forced or self._spacing.due(pose.T_odom_base)):
+                return False
+            self._spacing.take(pose.T_odom_base)
         self._recognizer.add(
             members,
             T_map_base,
