@@ -1,5 +1,9 @@
 """The thesis's filter: equation (33), its limit, its Jacobian, and batch least squares."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
 import numpy as np
 import pytest
 
@@ -81,6 +85,132 @@ def test_on_the_straight_it_is_batch_least_squares() -> None:
     covariance = np.linalg.inv(A.T @ A)[-3:, -3:]
     np.testing.assert_allclose(ekf.T_map_base[:3, 3], solution[-3:], atol=1e-6)
     np.testing.assert_allclose(ekf.covariance[:3, :3], covariance, atol=1e-6)
+
+
+@dataclass(frozen=True)
+class _TurningDrive:
+    """A filter's bends, and the linear problem that it solved on the way, angles unwrapped.
+
+    Attributes:
+        ekf: the filter after the last step.
+        start: mean of the prior [6].
+        G, moved: of each step, x' = moved + G (x - at): linearised where the filter was [n x ...].
+        at: where it was [n x 6].
+        measured, covariances: poses [n x 6] and their covariances.
+    """
+
+    ekf: ThesisEkf
+    start: se3.Array
+    G: se3.Array
+    moved: se3.Array
+    at: se3.Array
+    measured: se3.Array
+    covariances: se3.Array
+
+
+def _printed_33(state: se3.Array, v: float, turn_rate: float, dt: float) -> se3.Array:
+    """Equation (33) as printed; also for complex numbers."""
+    radius, theta, turned = v / turn_rate, state[5], state[5] + turn_rate * dt
+    out = state.copy()
+    out[0] += radius * (np.sin(turned) - np.sin(theta))
+    out[1] += radius * (np.cos(theta) - np.cos(turned))
+    out[5] = turned
+    return out
+
+
+def _turning_drive(steps: int = 25, v: float = 9.0, dt: float = 0.1) -> _TurningDrive:
+    rng = np.random.default_rng(3)
+    # Noise of all six, much of it correlated, and a heading that passes the back.
+    truth = np.array([4.0, -2.0, 0.5, 0.05, -0.04, 2.2])
+    start = truth + rng.normal(size=6) * [0.5, 0.5, 0.3, 0.1, 0.1, 0.2]
+    ekf = ThesisEkf(ThesisEkfConfig(), pose_matrix(start))
+    G, moved, at, measured, covariances = [], [], [], [], []
+    for k in range(steps):
+        turn_rate = 0.9 if k < 18 else -0.6
+        here = truth + wrapped(pose_vector(ekf.T_map_base) - truth)
+        # The complex step gives derivatives to the last digit, whoever's they are.
+        columns = [_printed_33(here + 1e-30j * e, v, turn_rate, dt).imag / 1e-30 for e in np.eye(6)]
+        G.append(np.array(columns).T)
+        at.append(here)
+        moved.append(_printed_33(here, v, turn_rate, dt))
+        truth = _printed_33(truth, v, turn_rate, dt)
+        root = rng.normal(size=(6, 6)) * np.array([[0.4, 0.3, 0.3, 0.05, 0.05, 0.1]]).T
+        covariances.append(root @ root.T + np.diag([0.01] * 3 + [1e-4] * 3))
+        measured.append(truth + np.linalg.cholesky(covariances[-1]) @ rng.normal(size=6))
+        ekf.predict(v, turn_rate, dt)
+        ekf.update(pose_matrix(measured[-1]), covariances[-1])
+    lists = (G, moved, at, measured, covariances)
+    return _TurningDrive(ekf, start, *(np.array(values) for values in lists))
+
+
+def _least_squares(drive: _TurningDrive) -> tuple[se3.Array, se3.Array]:
+    """Solve for all poses at once; return mean and covariance of the last."""
+    n = len(drive.G)
+    rows, values = [], []
+
+    def row(sqrt_information: se3.Array, value: se3.Array, *blocks: tuple[int, se3.Array]) -> None:
+        A = np.zeros((6, 6 * n + 6))
+        for i, block in blocks:
+            A[:, 6 * i : 6 * i + 6] = block
+        rows.append(sqrt_information @ A)
+        values.append(sqrt_information @ value)
+
+    row(np.diag([0.5**-0.5] * 3 + [0.125**-0.5] * 3), drive.start, (0, np.eye(6)))
+    moves = np.diag([0.5**-0.5] * 3 + [0.0625**-0.5] * 3)
+    for k in range(n):
+        constant = drive.moved[k] - drive.G[k] @ drive.at[k]
+        row(moves, constant, (k, -drive.G[k]), (k + 1, np.eye(6)))
+        sees = np.linalg.inv(np.linalg.cholesky(drive.covariances[k]))
+        row(sees, drive.measured[k], (k + 1, np.eye(6)))
+    A, b = np.concatenate(rows), np.concatenate(values)
+    mean = np.linalg.lstsq(A, b, rcond=None)[0][-6:]
+    return mean, np.linalg.inv(A.T @ A)[-6:, -6:]
+
+
+def _gtsam(drive: _TurningDrive) -> tuple[se3.Array, se3.Array]:
+    """Solve the same as a linear Gaussian factor graph."""
+    graph = gtsam.GaussianFactorGraph()
+    noise = gtsam.noiseModel.Diagonal.Variances
+    prior, moves = (np.array([0.5] * 3 + [rotation] * 3) for rotation in (0.125, 0.0625))
+    graph.push_back(gtsam.JacobianFactor(0, np.eye(6), drive.start, noise(prior)))
+    for k, G in enumerate(drive.G):
+        constant = drive.moved[k] - G @ drive.at[k]
+        graph.push_back(gtsam.JacobianFactor(k, -G, k + 1, np.eye(6), constant, noise(moves)))
+        # A JacobianFactor takes independent rows only: this is the information form.
+        information, z = np.linalg.inv(drive.covariances[k]), drive.measured[k]
+        seen = gtsam.HessianFactor(k + 1, information, information @ z, z @ information @ z)
+        graph.push_back(seen)
+    solution, last = graph.optimize(), len(drive.G)
+    return solution.at(last), gtsam.Marginals(graph, solution).marginalCovariance(last)
+
+
+@pytest.mark.parametrize('solve', [_least_squares, _gtsam])
+def test_through_bends_it_is_the_batch_solution(
+    solve: Callable[[_TurningDrive], tuple[se3.Array, se3.Array]],
+) -> None:
+    """Linearised where the filter was, the problem is linear: the last posterior is the batch's."""
+    drive = _turning_drive()
+    mean, covariance = solve(drive)
+    off = wrapped(pose_vector(drive.ekf.T_map_base) - mean)
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)
+    np.testing.assert_allclose(drive.ekf.covariance, covariance, rtol=1e-8, atol=1e-10)
+    assert mean[5] > np.pi  # it turned past its back, and the filter's own angle leapt
+    # Position and heading depend on each other: not just the diagonal was compared.
+    assert abs(covariance[0, 5]) > 1e-4
+
+
+def test_a_step_is_that_of_the_information_form() -> None:
+    """Y = P^-1 + R^-1 and y = P^-1 x + R^-1 z, from a predicted state whose covariance is full."""
+    before = _turning_drive(steps=10).ekf
+    before.predict(9.0, -0.4, 0.1)
+    x, P = pose_vector(before.T_map_base), before.covariance
+    z = x + np.array([0.8, -0.6, 0.2, 0.02, -0.03, 0.25])
+    R = np.diag([0.3, 0.1, 0.2, 0.01, 0.02, 0.03]) + 0.005
+    before.update(pose_matrix(z), R)
+    Y = np.linalg.inv(P) + np.linalg.inv(R)
+    mean = np.linalg.solve(Y, np.linalg.solve(P, x) + np.linalg.solve(R, z))
+    np.testing.assert_allclose(wrapped(pose_vector(before.T_map_base) - mean), 0.0, atol=1e-10)
+    np.testing.assert_allclose(before.covariance, np.linalg.inv(Y), atol=1e-12)
 
 
 def test_angles_meet_behind_the_back() -> None:
