@@ -11,6 +11,10 @@ POSITION, ROTATION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 GYROSCOPE, ACCELEROMETER = slice(9, 12), slice(12, 15)
 POSE = slice(0, 6)
 SIZE = 15
+# Odd, so that a median is one of them; long enough that a few lost samples do not move it.
+_INTERVALS = 11
+# Before two samples came, nothing tells how often they come.
+_ASSUMED_HZ = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,7 @@ class MotionState:
         doubtful: whether that sample is a guess (a frozen sensor): its noise is that of coasting.
         clones: past poses, in the order of their rows.
         memory: what to remember of each input, by name.
+        intervals_ns: times between the last inertial samples, without those across gaps.
     """
 
     stamp_ns: int
@@ -78,11 +83,26 @@ class MotionState:
     doubtful: bool = False
     clones: tuple[Clone, ...] = ()
     memory: tuple[tuple[str, Memory], ...] = ()
+    intervals_ns: tuple[int, ...] = ()
 
     @property
     def T_map_body(self) -> se3.Array:
         """Pose as 4x4 transform."""
         return se3.from_rotation_translation(self.R, self.p)
+
+    @property
+    def imu_hz(self) -> float:
+        """Return how many inertial samples come in a second, by the median of their intervals."""
+        if not self.intervals_ns:
+            return _ASSUMED_HZ
+        return 1e9 / sorted(self.intervals_ns)[len(self.intervals_ns) // 2]
+
+    def intervals_until(self, stamp_ns: int, longest_ns: int) -> tuple[int, ...]:
+        """Return the intervals with that to a new sample, unless it is a gap or the first."""
+        interval_ns = stamp_ns - self.imu_ns
+        if self.turn_rate is None or not 0 < interval_ns <= longest_ns:
+            return self.intervals_ns
+        return (*self.intervals_ns[1 - _INTERVALS :], interval_ns)
 
     def remembered(self, source: str) -> Memory | None:
         """Return what is remembered of an input, None before its first observation."""

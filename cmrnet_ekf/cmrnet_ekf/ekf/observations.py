@@ -143,7 +143,7 @@ class TwistObservation:
     """A twist of the sensor in its own axes, linear first [6], with covariance 6x6 in these axes.
 
     The angular part observes the gyroscope bias: it counts only while an inertial sample holds, and
-    the gyroscope's noise is added to it (`gyroscope_variance`, of one sample).
+    that sample's noise is added to it (`gyroscope_noise` is its density, rad/s/sqrt(Hz)).
     """
 
     stamp_ns: int
@@ -153,7 +153,7 @@ class TwistObservation:
     T_body_sensor: se3.Array = field(default_factory=lambda: _HERE)
     axes: Axes = ALL6
     correlation_s: float = 0.0
-    gyroscope_variance: float = 0.0
+    gyroscope_noise: float = 0.0
 
     @property
     def numbers(self) -> se3.Array:
@@ -176,7 +176,7 @@ class TwistObservation:
             H[:3, GYROSCOPE] = R_body.T @ se3.hat(arm)
             H[3:, GYROSCOPE] = -R_body.T
         covariance = self.covariance.copy()
-        covariance[3:, 3:] += self.gyroscope_variance * np.eye(3)
+        covariance[3:, 3:] += self.gyroscope_noise**2 * state.imu_hz * np.eye(3)
         axes = self.axes if turning else (*self.axes[:3], False, False, False)
         return Innovation(self.twist - expected, H, covariance).rows(axes)
 

@@ -89,6 +89,7 @@ class Propagation:
             state.doubtful,
             state.clones,
             state.memory,
+            state.intervals_ns,
         )
 
     def _coast(self, state: MotionState, stamp_ns: int) -> MotionState:

@@ -65,6 +65,7 @@ class VehicleEkf:
     def __init__(self, settings: EkfSettings, T_body_base: se3.Array | None = None) -> None:
         self.settings = settings
         self.propagation = Propagation(settings.motion)
+        self._hold_ns = round(settings.motion.imu_hold * 1e9)
         self._update = Update(settings.gate)
         base = np.eye(4) if T_body_base is None else T_body_base
         self._constraints = Constraints(settings.constraint, base, self._update)
@@ -120,7 +121,12 @@ class VehicleEkf:
         for at_ns, turn_rate, force, doubtful in sorted(self._early, key=lambda sample: sample[0]):
             if at_ns <= stamp_ns:
                 state = replace(
-                    state, turn_rate=turn_rate, force=force, imu_ns=at_ns, doubtful=doubtful
+                    state,
+                    turn_rate=turn_rate,
+                    force=force,
+                    imu_ns=at_ns,
+                    doubtful=doubtful,
+                    intervals_ns=state.intervals_until(at_ns, self._hold_ns),
                 )
                 self._history = History(state, round(self.settings.history.length * 1e9))
             elif at_ns != self._history.newest.imu_ns:
@@ -221,6 +227,7 @@ class VehicleEkf:
         state: MotionState,
     ) -> tuple[MotionState, None]:
         before_ns = state.imu_ns
+        intervals_ns = state.intervals_until(stamp_ns, self._hold_ns)
         state = self.propagation.to(state, stamp_ns)
         # By hand, for this is done for every sample: replace() takes longer.
         state = MotionState(
@@ -237,6 +244,7 @@ class VehicleEkf:
             doubtful,
             state.clones,
             state.memory,
+            intervals_ns,
         )
         if self._constraints.due(before_ns, stamp_ns):
             state = self._constraints.hold(state)
@@ -278,8 +286,9 @@ def _estimate(state: MotionState, gyroscope_noise: float) -> Estimate:
     if turning:
         J[3:, 9:12] = -np.eye(3)
     twist_covariance = J @ state.covariance @ J.T
-    # One sample's noise at 100 Hz; without a sample nothing is known of the turn.
-    twist_covariance[3:, 3:] += np.eye(3) * (100.0 * gyroscope_noise**2 if turning else 1.0)
+    # One sample's noise is white: its variance grows with the rate at which samples come. Without
+    # one nothing is known of the turn.
+    twist_covariance[3:, 3:] += np.eye(3) * (state.imu_hz * gyroscope_noise**2 if turning else 1.0)
     return Estimate(
         state.stamp_ns,
         state.T_map_body,

@@ -44,11 +44,13 @@ class EkfHealth:
         self.settings = settings
         self._node, self._diagnostics = node, diagnostics
         self._inputs: dict[str, _Input] = {}
-        self._absolute_ns: int | None = None
+        # From when silence counts where nothing came; by the node's clock, as all times here.
+        self._begun_ns = self._absolute_ns = self._now_ns()
+        self._checked_ns = 0
         self._recovered_ns: int | None = None
 
     def add(self, name: str, timeout_s: float, *, absolute: bool = False) -> None:
-        """Watch an input."""
+        """Watch an input; with an infinite timeout it may be silent."""
         self._inputs[name] = _Input(timeout_s, absolute)
         if name == 'imu':  # it moves the estimate and is not judged by it
             return
@@ -87,23 +89,24 @@ class EkfHealth:
 
     def restarted(self) -> None:
         """Forget what was before a start."""
-        self._absolute_ns, self._recovered_ns = self._now_ns(), None
         for seen in self._inputs.values():
-            seen.rejected, seen.came_ns = 0, None
+            seen.rejected = 0
+        self._count_from(self._now_ns())
 
     def check(self, ekf: VehicleEkf | None, *, enabled: bool, waits_for: str | None) -> None:
         """Raise and clear problems; called once a second."""
         problem = self._diagnostics
+        self._mind_the_clock()
         problem.warn('enabled', None if enabled else 'disabled: ~/enable switches it on')
         problem.warn('start', waits_for)
         for name, seen in self._inputs.items():
-            self._check_input(name, seen)
+            self._check_input(name, seen, enabled)
         recent = self._recovered_ns is not None and self._seconds_since(self._recovered_ns) < 10.0
         problem.warn('recovered', 'gave in to rejected observations' if recent else None)
         estimate = None if ekf is None else ekf.estimate()
         unsure = None
         absolute = any(seen.absolute for seen in self._inputs.values())
-        if absolute and self._absolute_ns is not None and estimate is not None:
+        if absolute and estimate is not None:
             silent = self._seconds_since(self._absolute_ns)
             if silent > self.settings.absolute_error:
                 unsure = f'no pose and no fix was accepted for {silent:.0f} s'
@@ -115,17 +118,32 @@ class EkfHealth:
         problem.error('position is bad', text if bad else None)
         problem.warn('position is poor', text if poor else None)
 
-    def _check_input(self, name: str, seen: _Input) -> None:
-        silent = 0.0 if seen.came_ns is None else self._seconds_since(seen.came_ns)
-        text = None
-        if silent > seen.timeout_s:
+    def _check_input(self, name: str, seen: _Input, enabled: bool) -> None:
+        came_ns = self._begun_ns if seen.came_ns is None else seen.came_ns
+        silent, text = self._seconds_since(came_ns), None
+        if enabled and silent > seen.timeout_s:
             text = f'{name} has been silent for {silent:.1f} s'
+            if seen.came_ns is None:
+                text += ': nothing came since the start'
         raised = self._diagnostics.error if name == 'imu' else self._diagnostics.warn
         raised(f'silent {name}', text)
         refused = None
         if seen.rejected >= self.settings.rejected_warn:
             refused = f'{name} was rejected {seen.rejected} times in a row: wrong, or too sure'
         self._diagnostics.warn(f'refused {name}', refused)
+
+    def _mind_the_clock(self) -> None:
+        """Count anew when the clock jumped back, or begins (a simulated one stands at 0 before)."""
+        now_ns = self._now_ns()
+        if now_ns < max(self._begun_ns, self._checked_ns) or self._begun_ns == 0:
+            self._count_from(now_ns)
+        self._checked_ns = now_ns
+
+    def _count_from(self, now_ns: int) -> None:
+        self._begun_ns = self._absolute_ns = now_ns
+        self._recovered_ns = None
+        for seen in self._inputs.values():
+            seen.came_ns = None
 
     def _now_ns(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

@@ -191,6 +191,8 @@ class EkfNode(Node):
         """Take input, or ignore it (then the estimate is forgotten: it would be out of date)."""
         if self.enabled and not request.data:
             self.restart()
+        elif request.data and not self.enabled:
+            self.health.restarted()  # nothing was heard meanwhile
         self.enabled = request.data
         response.success = True
         response.message = 'enabled' if self.enabled else 'disabled: all input is ignored'

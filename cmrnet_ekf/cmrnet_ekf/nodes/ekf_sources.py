@@ -1,5 +1,6 @@
 """Subscribe the EKF's poses, odometry, twists and fixes, and make observations of them."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
     from cmrnet_ekf.nodes.ekf_node import EkfNode
 
 Axes = tuple[bool, ...]
-# A gyroscope sample's rate, for the noise that it adds to a measured turn rate.
-_SAMPLES_HZ = 100.0
 
 
 @config
@@ -224,7 +223,6 @@ class EkfSources:
         T_body_sensor: se3.Array,
     ) -> None:
         given = np.asarray(twist.covariance, np.float64).reshape(6, 6)
-        noise = self._node.settings.motion.gyroscope_noise
         self._node.observe(
             TwistObservation(
                 stamp_ns,
@@ -234,7 +232,7 @@ class EkfSources:
                 T_body_sensor,
                 axes,
                 correlation_s,
-                _SAMPLES_HZ * noise**2,
+                self._node.settings.motion.gyroscope_noise,
             )
         )
 
@@ -248,11 +246,14 @@ class EkfSources:
         axes = axes_of(settings.axes, rows, name)
         absolute = cls in (PoseInputConfig, FixInputConfig)
         self._names.append(name)
-        node.health.add(name, settings.timeout, absolute=absolute)
+        idle = cls is OdometryInputConfig and settings.use == 'nothing'
+        needed = not idle or node.config.tf == 'map_to_odom'
+        node.health.add(name, settings.timeout if needed else math.inf, absolute=absolute)
         if cls is OdometryInputConfig and settings.use == 'both':
-            # Two kinds of observation of one message are two inputs to the gate.
+            # Two kinds of observation of one message are two inputs to the gate, but only one can
+            # be silent.
             self._names.append(f'{name} twist')
-            node.health.add(f'{name} twist', settings.timeout)
+            node.health.add(f'{name} twist', math.inf)
         tolerance_ns = max(round(node.settings.history.length * 1e9), 1_000_000_000)
         self._guards[name] = StampGuard(tolerance_ns)
         profile = qos.SENSOR_FAST if message_class is NavSatFix else qos.RELIABLE
