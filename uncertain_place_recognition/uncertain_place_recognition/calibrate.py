@@ -2,19 +2,24 @@
 
 import argparse
 import json
+import logging
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lcd_common.command_line import run
+from lcd_common.setting_changes import changed
 from uncertain_place_recognition.acceptance import KINDS, available, needed
+from uncertain_place_recognition.ambiguity import AmbiguityConfig
 from uncertain_place_recognition.evaluate import RESULTS, add_inputs, results_folder, share
 
 if TYPE_CHECKING:
     from uncertain_place_recognition.calibration import Calibrated
     from uncertain_place_recognition.query_table import QueryTable
 
+_log = logging.getLogger(__name__)
 _EXAMPLES = """
 examples:
   calibrate_place_recognition runs/calibration --ensemble weights/ensemble.safetensors \\
@@ -63,8 +68,9 @@ def _run(arguments: argparse.Namespace) -> None:
     settings = PairConfig(
         radius=arguments.radius, excluded=2.0 * arguments.radius, metric=arguments.metric
     )
+    ambiguity = changed(AmbiguityConfig(), arguments.ambiguity)
     table = query_table(
-        runs, settings, arguments.no_match, arguments.seed, together=not arguments.apart
+        runs, settings, arguments.no_match, arguments.seed, ambiguity, together=not arguments.apart
     )
     targets = sorted({*TARGETS, arguments.target})
     found = calibrate(table, targets, confidence=arguments.confidence, seed=arguments.seed)
@@ -79,9 +85,16 @@ def _run(arguments: argparse.Namespace) -> None:
         file.save(out / f'{name}.json')
     figures = _figures(found, table)
     figures['resplits'] = [one.plain() for one in observed]
+    figures['ambiguity'] = asdict(ambiguity)
     (out / RESULTS).write_text(json.dumps(figures, indent=2) + '\n')
     _draw(found, table, out)
     sys.stdout.write(_text(figures) + f'\nwritten to {out}\n')
+    if ambiguity != AmbiguityConfig():
+        # The file does not hold these settings, and other ones give other probabilities.
+        _log.warning(
+            'calibrated with other settings of ambiguity than the node has: give Trust the same '
+            'AmbiguityConfig, and do not copy this calibration.json beside weights for the node'
+        )
 
 
 def _percent(target: float) -> str:

@@ -23,6 +23,8 @@ class EmbeddedRun:
         positions: [N x 2] true, in the world's plane, metres.
         members: by the names of ensembles, embeddings [N x M x D] each; M = 1 for a single network.
         facts: how they were made.
+        asking: [N] which submaps are queries; None: all. It is no part of the file.
+        searched: whether the queries of others are searched in it. It is no part of the file.
     """
 
     name: str
@@ -31,6 +33,8 @@ class EmbeddedRun:
     positions: NDArray[np.float64]
     members: dict[str, NDArray[np.float32]]
     facts: dict[str, Any] = field(default_factory=dict)
+    asking: NDArray[np.bool_] | None = None
+    searched: bool = True
 
     def __post_init__(self) -> None:
         number = len(self.stamps_ns)
@@ -38,6 +42,11 @@ class EmbeddedRun:
             raise DataError(
                 f'run {self.name}: expected {number} positions x y, got the shape '
                 f'{self.positions.shape}'
+            )
+        if self.asking is not None and self.asking.shape != (number,):
+            raise DataError(
+                f'run {self.name}: expected {number} flags of queries, got the shape '
+                f'{self.asking.shape}'
             )
         for name, whole in self.members.items():
             if whole.ndim != 3 or len(whole) != number or not whole.shape[1]:
@@ -57,6 +66,19 @@ class EmbeddedRun:
                 f'{", ".join(self.members) or "none"}'
             )
         return self.members[ensemble]
+
+    @property
+    def asks(self) -> bool:
+        """Whether any of its submaps is a query."""
+        return self.asking is None or bool(self.asking.any())
+
+    def queries(self) -> 'EmbeddedRun':
+        """Return the submaps that are queries, as a run."""
+        if self.asking is None:
+            return self
+        members = {name: whole[self.asking] for name, whole in self.members.items()}
+        stamps_ns, positions = self.stamps_ns[self.asking], self.positions[self.asking]
+        return EmbeddedRun(self.name, self.world, stamps_ns, positions, members, self.facts)
 
     def save(self, path: Path) -> None:
         """Write an .npz file (numbers and JSON alone); a crash leaves the file of before."""
@@ -112,8 +134,10 @@ def is_embedded(path: Path) -> bool:
 def ordered_pairs(runs: Sequence[EmbeddedRun]) -> list[tuple[int, int]]:
     """Return (database, queries) of every ordered pair of different runs of one world.
 
+    Runs that are not searched are no databases, runs that do not ask no queries.
+
     Raises:
-        DataError: no two runs are of one world.
+        DataError: no two runs are of one world, or none of them asks in another one.
     """
     pairs = [
         (m, n)
@@ -121,7 +145,14 @@ def ordered_pairs(runs: Sequence[EmbeddedRun]) -> list[tuple[int, int]]:
         for n, queries in enumerate(runs)
         if m != n and database.world == queries.world
     ]
+    worlds = ', '.join(f'{run.name} in {run.world}' for run in runs) or 'no runs'
     if not pairs:
-        worlds = ', '.join(f'{run.name} in {run.world}' for run in runs)
-        raise DataError(f'no two runs are of one world: {worlds or "no runs"}')
+        raise DataError(f'no two runs are of one world: {worlds}')
+    pairs = [(m, n) for m, n in pairs if runs[m].searched and runs[n].asks]
+    if not pairs:
+        raise DataError(
+            'no run with queries has a database of its world; databases: '
+            f'{", ".join(f"{r.name} in {r.world}" for r in runs if r.searched) or "none"}; '
+            f'queries: {", ".join(f"{r.name} in {r.world}" for r in runs if r.asks) or "none"}'
+        )
     return pairs

@@ -3,12 +3,22 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from lcd_common.command_line import run
-from lcd_common.errors import DataError
+from lcd_common.errors import ConfigError, DataError
+from lcd_common.setting_changes import changed
+from uncertain_place_recognition.ambiguity import AmbiguityConfig
+from uncertain_place_recognition.datasets.regions import SITES
 from uncertain_place_recognition.embedded_run import EmbeddedRun
+
+if TYPE_CHECKING:
+    from uncertain_place_recognition.ensemble import EmbeddingEnsemble
 
 RESULTS = 'results.json'
 _EXAMPLES = """
@@ -18,10 +28,15 @@ examples:
       students=weights/students naive=weights/triplet dropout=weights/dropout stun=weights/stun \\
       --save-embeddings embedded/town --out results/town
   evaluate_place_recognition embedded/town --metric euclidean --out results/town_euclidean
+  evaluate_place_recognition --database runs/DCC01.npz --queries runs/DCC02.npz \\
+      --ensemble weights --out results/mulran          MulRan: one run is the map, another one asks
+  evaluate_place_recognition runs/oxford --query-region oxford --metric euclidean \\
+      --ensemble weights --out results/oxford          the PointNetVLAD benchmark's test regions
   evaluate_place_recognition embedded/town --calibration weights/calibration.json --open-set \\
       --no-match 0.3 --out results/town_open
 
-Every run is searched in every other run of its world. A match within --radius is right; recall
+Every run is searched in every other run of its world; runs of --database only are searched, those
+of --queries only ask. A match within --radius is right; recall
 leaves out queries whose place the other run does not have, and is a plain mean over pairs of runs.
 Roles: teacher (one network), students (of one feature space), naive (networks trained apart, also
 searched one by one as Mason et al. do), dropout (passes with dropout), stun (predicts a variance).
@@ -39,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from uncertain_place_recognition.evaluation.pairs import PairConfig, available
     from uncertain_place_recognition.evaluation.study import study
     from uncertain_place_recognition.evaluation.tables import text_tables
-    from uncertain_place_recognition.run_inputs import load_embedded, load_ensembles, weights_of
+    from uncertain_place_recognition.run_inputs import load_ensembles, weights_of
     from uncertain_place_recognition.trust import Calibration
 
     out = results_folder(arguments.out)
@@ -48,7 +63,7 @@ def _run(arguments: argparse.Namespace) -> None:
         radius=arguments.radius, excluded=2.0 * arguments.radius, metric=arguments.metric
     )
     ensembles = load_ensembles(arguments.ensemble, arguments.device)
-    runs = load_embedded(arguments.runs, ensembles, arguments.save_embeddings, arguments.quiet)
+    runs = _runs(arguments, ensembles)
     if not available(runs):
         raise DataError(f'no ensemble embedded all runs: {_embedded_by(runs)}')
     if calibration is not None:
@@ -66,13 +81,45 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.open_set,
         arguments.no_match,
         arguments.seed,
+        changed(AmbiguityConfig(), arguments.ambiguity),
     )
-    figures = found.plain()
+    figures = {**found.plain(), 'query_region': arguments.query_region}
     out.mkdir(parents=True, exist_ok=True)
     (out / RESULTS).write_text(json.dumps(figures, indent=2) + '\n')
     pictures = write_pictures(found, out)
     sys.stdout.write(text_tables(figures) + '\n')
     sys.stdout.write(f'written to {out}: {RESULTS}, {", ".join(p.name for p in pictures)}\n')
+
+
+def _runs(
+    arguments: argparse.Namespace, ensembles: 'Mapping[str, EmbeddingEnsemble]'
+) -> list[EmbeddedRun]:
+    """Return all runs, each with its part: databases, those that ask, and those that do both."""
+    from uncertain_place_recognition.datasets.regions import in_test_region
+    from uncertain_place_recognition.run_inputs import load_embedded
+
+    if not (arguments.runs or (arguments.database and arguments.queries)):
+        raise ConfigError('name runs, or runs for --database and for --queries')
+    runs: list[EmbeddedRun] = []
+    for paths, asks, searched in (
+        (arguments.runs, True, True),
+        (arguments.database, False, True),
+        (arguments.queries, True, False),
+    ):
+        if not paths:
+            continue
+        keep, quiet = arguments.save_embeddings, arguments.quiet
+        for one in load_embedded(paths, ensembles, keep, quiet):
+            asking = None if asks else np.zeros(len(one), bool)
+            if asks and arguments.query_region is not None:
+                asking = in_test_region(one.positions, arguments.query_region)
+            runs.append(replace(one, asking=asking, searched=searched))
+    if arguments.query_region is not None and not any(one.asks for one in runs):
+        raise DataError(
+            f'no submap of {len(runs)} runs lies in a test region of {arguments.query_region}; are '
+            "they the benchmark's, made by make_submap_runs --benchmark of this site's files?"
+        )
+    return runs
 
 
 def results_folder(out: Path) -> Path:
@@ -92,10 +139,10 @@ def share(text: str) -> float:
     return value
 
 
-def add_inputs(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name runs and ensembles."""
+def add_inputs(parser: argparse.ArgumentParser, runs: str = '+') -> None:
+    """Add the arguments that name runs (+, or * where others name them too) and ensembles."""
     parser.add_argument(
-        'runs', nargs='+', type=Path, help='.npz files of runs, or folders with such'
+        'runs', nargs=runs, type=Path, help='.npz files of runs, or folders with such'
     )
     parser.add_argument('--out', type=Path, required=True, help='folder for what is written')
     parser.add_argument(
@@ -105,6 +152,11 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--save-embeddings', type=Path, metavar='FOLDER', help='keep embeddings for later calls'
     )
+    parser.add_argument(
+        '--ambiguity', nargs='+', default=[], metavar='NAME=VALUE',
+        help='spread of matches and ratio to the next place: '
+        + ', '.join(one.name for one in fields(AmbiguityConfig)),
+    )  # fmt: skip
     parser.add_argument('--device', default='cpu', help='cpu, cuda or cuda:N (cpu)')
     parser.add_argument('--seed', type=int, default=0, help='of what is drawn (0)')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
@@ -121,7 +173,19 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add_inputs(parser)
+    add_inputs(parser, runs='*')
+    parser.add_argument(
+        '--database', nargs='+', type=Path, default=[], metavar='RUN',
+        help='runs that are searched, and do not ask',
+    )  # fmt: skip
+    parser.add_argument(
+        '--queries', nargs='+', type=Path, default=[], metavar='RUN',
+        help='runs that ask, and are not searched',
+    )  # fmt: skip
+    parser.add_argument(
+        '--query-region', choices=SITES,
+        help="ask only from the benchmark's test regions of this site; databases stay whole",
+    )  # fmt: skip
     parser.add_argument(
         '--ensemble', nargs='+', default=[], metavar='[ROLE=]PATH',
         help='weights that embed submaps; without a role: students',

@@ -1,10 +1,12 @@
 """Read runs of the PointNetVLAD benchmark (Oxford, U.S., R.A., B.D.), as its authors published it.
 
-    SITE/RUN/{pointcloud_locations_*.csv, pointcloud_*/STAMP.bin}
+    oxford/RUN/{pointcloud_locations_*.csv, pointcloud_*/STAMP.bin}
+    inhouse_datasets/RUN/{pointcloud_centroids_*.csv, pointcloud_25m_*/STAMP.bin}
 
 A .bin is 4096 rows of x y z in float64, already normalised (`submap.benchmark_normalised`); the
-table has the columns timestamp, northing, easting. A run may hold several sets (Oxford's
-pointcloud_20m for tests and pointcloud_20m_10overlap for training).
+table has the columns timestamp, northing, easting. A run may hold several sets: pointcloud_20m for
+tests and pointcloud_20m_10overlap for training (Oxford), pointcloud_25m_25 for tests and
+pointcloud_25m_10 for training (the others). Which submaps are for tests: `regions`.
 """
 
 import csv
@@ -18,6 +20,7 @@ from uncertain_place_recognition.runs import SubmapRun
 
 POINTS = 4096
 _BYTES = POINTS * 3 * 8
+_TABLES = ('pointcloud_locations_', 'pointcloud_centroids_')
 # Normalised submaps lie within 1, 0.5 from their middle in the mean. Pairs of float32 numbers read
 # as float64 are near zero, metres are far outside.
 _LARGEST, _LEAST_SPREAD = 1.5, 0.05
@@ -70,13 +73,17 @@ def read_benchmark_run(folder: Path, submaps: str = '', world: str = '') -> Subm
             f'{folder}: expected one folder of submaps, got {", ".join(sets) or "none"}; choose '
             'with submaps'
         )
-    tables = sorted(folder.glob('pointcloud_locations_*.csv'))
+    tables = sorted(t for kind in _TABLES for t in folder.glob(f'{kind}*.csv'))
+    # pointcloud_25m_10 belongs to pointcloud_centroids_10.csv, pointcloud_20m to .._locations_20m.
     suffix = chosen.removeprefix('pointcloud_')
-    fitting = [t for t in tables if t.stem.removeprefix('pointcloud_locations_') == suffix]
+    suffixes = {suffix, suffix.removeprefix('25m_')}
+    fitting = [t for t in tables if _suffix(t) in suffixes]
     candidates = fitting or tables
     if len(candidates) != 1:
         names = ', '.join(t.name for t in tables) or 'none'
-        raise DataError(f'{folder}: expected pointcloud_locations_{suffix}.csv, got {names}')
+        raise DataError(
+            f'{folder}: expected pointcloud_locations_{suffix}.csv (or _centroids_), got {names}'
+        )
     rows = _rows(candidates[0])
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :2, 3] = [(easting, northing) for _, northing, easting in rows]
@@ -88,6 +95,14 @@ def read_benchmark_run(folder: Path, submaps: str = '', world: str = '') -> Subm
     facts = {'normalisation': 'benchmark', 'set': chosen}
     name = f'{folder.parent.name}_{folder.name}'
     return SubmapRun(name, world or folder.parent.name, stamps, poses, points, facts)
+
+
+def _suffix(table: Path) -> str:
+    """Return what the name of a table says after its kind: 20m, 20m_10overlap, 10, 25."""
+    name = table.stem
+    for kind in _TABLES:
+        name = name.removeprefix(kind)
+    return name
 
 
 def _rows(table: Path) -> list[tuple[str, float, float]]:

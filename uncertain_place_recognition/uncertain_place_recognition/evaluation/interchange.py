@@ -49,13 +49,14 @@ def interchange(
     s = settings or PairConfig()
     matrices, chances = [], []
     for m, n in ordered_pairs(runs):
+        asking = runs[n].queries()
         tree = cKDTree(runs[m].positions)
-        true = np.array([len(f) for f in tree.query_ball_point(runs[n].positions, s.radius)])
+        true = np.array([len(f) for f in tree.query_ball_point(asking.positions, s.radius)])
         known = true > 0
         if not known.any():
             continue
-        database, queries = runs[m].of(ensemble), runs[n].of(ensemble)[known]
-        here = runs[n].positions[known]
+        database, queries = runs[m].of(ensemble), asking.of(ensemble)[known]
+        here = asking.positions[known]
         matrices.append(
             [
                 [

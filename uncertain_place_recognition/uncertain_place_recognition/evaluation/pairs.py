@@ -85,7 +85,7 @@ def judge_pairs(
     no_match_share: float = 0.0,
     seed: int = 0,
 ) -> list[JudgedPair]:
-    """Judge a method of METHODS on all ordered pairs of runs of one world.
+    """Judge a method of METHODS on all ordered pairs of runs of one world (`ordered_pairs`).
 
     Args:
         runs: all.
@@ -120,10 +120,17 @@ def judge_pair(
         pair: numbers of two of them.
         method: of METHODS.
         settings: radius and metric.
-        masked: [Q] queries from whose database their place is taken away: they have no match.
+        masked: [N] submaps of the second from whose database their place is taken away: they have
+            no match.
+
+    Returns:
+        One row for every submap of the second run that asks.
     """
     s = settings
-    database, queries = runs[pair[0]], runs[pair[1]]
+    database, queries = runs[pair[0]], runs[pair[1]].queries()
+    asking = runs[pair[1]].asking
+    if masked is not None and asking is not None:
+        masked = masked[asking]
     tree = cKDTree(database.positions)
     known = tree.query(queries.positions)[0] <= s.radius
     allowed = None

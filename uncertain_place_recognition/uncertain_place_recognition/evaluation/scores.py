@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_place_recognition.ambiguity import AmbiguityConfig
 from uncertain_place_recognition.evaluation.bootstrap import drawn_pairs, interval
 from uncertain_place_recognition.evaluation.failure import (
     aurc,
@@ -67,13 +68,17 @@ class JudgedScore:
 
 
 def doubt_of(
-    pair: JudgedPair, measure: str, metric: str, model: MatchModel | None = None
+    pair: JudgedPair,
+    measure: str,
+    metric: str,
+    model: MatchModel | None = None,
+    ambiguity: AmbiguityConfig | None = None,
 ) -> NDArray[np.float64]:
     """Return a doubt [Q]: a measure of the ranking, a feature by name, or the model's belief."""
     if measure == 'top1':
         return pair.ranking.doubt['distance' if metric == 'euclidean' else 'similarity']
     if measure in ('combined', 'ambiguity', 'ratio'):
-        rows = feature_rows(pair, metric)
+        rows = feature_rows(pair, metric, ambiguity)
         if measure == 'combined':
             assert model is not None
             return -model.belief(rows)

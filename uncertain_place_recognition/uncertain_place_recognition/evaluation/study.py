@@ -1,11 +1,12 @@
 """Evaluate all methods for which runs have embeddings, and put the figures together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from uncertain_place_recognition.ambiguity import AmbiguityConfig
 from uncertain_place_recognition.embedded_run import EmbeddedRun, ordered_pairs
 from uncertain_place_recognition.evaluation.calibration_error import Reliability, reliability
 from uncertain_place_recognition.evaluation.interchange import Interchange, interchange
@@ -63,8 +64,9 @@ def study(
     open_set: bool = False,
     no_match_share: float = 0.0,
     seed: int = 0,
+    ambiguity: AmbiguityConfig | None = None,
 ) -> Study:
-    """Evaluate every method on all ordered pairs of runs of one world.
+    """Evaluate every method on all ordered pairs of runs of one world (`ordered_pairs`).
 
     Args:
         runs: with embeddings by the names that `pairs.METHODS` uses.
@@ -74,9 +76,10 @@ def study(
         open_set: count queries without their place in the database as failures.
         no_match_share: of queries, drawn, from whose database their place is taken away.
         seed: of the draw.
+        ambiguity: as the model was fitted with.
 
     Raises:
-        DataError: no two runs are of one world.
+        DataError: no two runs are of one world, or none of them asks in another one.
     """
     s = settings or PairConfig()
     judged = {name: judge_pairs(runs, name, s, no_match_share, seed) for name in available(runs)}
@@ -84,7 +87,9 @@ def study(
     scores = {}
     for name, (method, measure) in SCORES.items():
         if method in judged and (measure != 'combined' or model is not None):
-            doubts = [doubt_of(pair, measure, s.metric, model) for pair in judged[method]]
+            doubts = [
+                doubt_of(pair, measure, s.metric, model, ambiguity) for pair in judged[method]
+            ]
             scores[name] = judge_score(judged[method], doubts, open_set)
     groups = set.intersection(*(set(run.members) for run in runs)) - set(_NO_SPACE)
     exchanged = {
@@ -92,17 +97,26 @@ def study(
     }
     observed = None
     if model is not None and 'shared' in judged:
-        rows = np.concatenate([feature_rows(pair, s.metric) for pair in judged['shared']])
+        rows = np.concatenate(
+            [feature_rows(pair, s.metric, ambiguity) for pair in judged['shared']]
+        )
         wrong = np.concatenate([pair.wrong for pair in judged['shared']])
         observed = reliability(model.false_match_probability(rows), wrong)
     facts = {
-        'runs': [{'name': r.name, 'world': r.world, 'submaps': len(r)} for r in runs],
+        'runs': [
+            {
+                'name': r.name, 'world': r.world, 'submaps': len(r), 'searched': r.searched,
+                'queries': len(r.queries()),
+            }
+            for r in runs
+        ],
         'pairs': len(ordered_pairs(runs)),
         'metric': s.metric,
         'radius_m': s.radius,
         'open_set': open_set,
         'no_match_share': no_match_share,
-    }
+        'ambiguity': asdict(ambiguity or AmbiguityConfig()),
+    }  # fmt: skip
     return Study(
         {name: one for name, one in recalls.items() if one is not None},
         {name: one for name, one in scores.items() if one is not None},
