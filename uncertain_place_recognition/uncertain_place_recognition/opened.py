@@ -7,6 +7,7 @@ from lcd_common.errors import ConfigError
 from lcd_loop_closure.reduction import ReductionConfig
 from uncertain_place_recognition.ensemble import EmbeddingEnsemble
 from uncertain_place_recognition.place_recognizer import PlaceRecognizer, PlaceRecognizerConfig
+from uncertain_place_recognition.retrieval.engines import IndexMaker
 from uncertain_place_recognition.submap import SubmapMaker
 from uncertain_place_recognition.trust import Calibration, Trust
 from uncertain_place_recognition.weights_hash import weights_hash
@@ -21,6 +22,7 @@ def open_recognizer(
     settings: PlaceRecognizerConfig | None = None,
     reduction: ReductionConfig | None = None,
     device: str = 'auto',
+    index: IndexMaker | None = None,
 ) -> PlaceRecognizer:
     """Return a recognizer without places.
 
@@ -31,11 +33,14 @@ def open_recognizer(
         settings: of answers and growth.
         reduction: of the clouds that are kept.
         device: auto (a GPU where there is one), cpu, cuda or cuda:N.
+        index: makes what searches the places; None: all are compared.
 
     Raises:
-        ConfigError: there are no weights, or no such device.
+        ConfigError: there are no weights, no such device, or no such index with this calibration.
+        MissingPackageError: the index needs a package that is not installed.
         DataError: the weights cannot be read.
-        MapError: the calibration cannot be read, or belongs to other weights.
+        MapError: the calibration cannot be read, or belongs to other weights; or a shared map does
+            not answer.
     """
     path = Path(weights).expanduser() if weights else SHIPPED
     if not path.exists():
@@ -54,5 +59,6 @@ def open_recognizer(
         trust,
         settings,
         reduction,
+        index,
         fingerprint=fingerprint,
     )

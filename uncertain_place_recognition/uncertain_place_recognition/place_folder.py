@@ -98,19 +98,24 @@ def load_places(path: str | Path, ensemble: str, index: WindowedIndex) -> SavedP
     meta = _checked_meta(folder, ensemble)
     try:
         places = _places_from(_read(folder / 'places.npz'))
-        index.load(folder / 'descriptors.npz')
+        ids, rows = index.read(folder / 'descriptors.npz')
         files = sorted((folder / 'clouds').glob('*.npz'))
         clouds = {id: cloud for file in files for id, cloud in _read_clouds(file)}
     except FileNotFoundError as error:
         raise MapError(f'{error.filename}: missing; the map is incomplete, save it anew') from None
     except (DataError, KeyError, TypeError, ValueError) as error:
         raise MapError(f'{folder}: not readable ({error}); save the map anew') from error
-    counts = len(places), len(index), len(clouds)
+    counts = len(places), len(ids), len(clouds)
     if counts != (meta.get('places'), meta.get('places'), meta.get('clouds')):
         raise MapError(
             f'{folder}: expected {meta.get("places")} places with {meta.get("clouds")} clouds, got '
             f'{counts[0]} with {counts[1]} descriptors and {counts[2]} clouds; save the map anew'
         )
+    if set(ids.tolist()) != {place.id for place in places}:
+        raise MapError(f'{folder}: its descriptors are of other places; save the map anew')
+    # Only now: what a shared index takes in, others see.
+    index.note_poses(places)
+    index.add_many(ids, rows)
     return SavedPlaces(ensemble, places, clouds)
 
 

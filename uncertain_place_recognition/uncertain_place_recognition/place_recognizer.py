@@ -16,9 +16,11 @@ from lcd_loop_closure.compact_cloud import CompactCloud, compact
 from lcd_loop_closure.reduction import ReductionConfig, reduce_cloud
 from uncertain_place_recognition.place import Judgement, Match, Place, PlaceAnswer
 from uncertain_place_recognition.place_folder import SavedPlaces, load_places, save_places
-from uncertain_place_recognition.retrieval.exact_index import ExactIndex
+from uncertain_place_recognition.retrieval.engines import IndexMaker
+from uncertain_place_recognition.retrieval.fleet_place import FleetPlace
 from uncertain_place_recognition.retrieval.insertion_window import InsertionConfig
 from uncertain_place_recognition.retrieval.place_index import Neighbours
+from uncertain_place_recognition.retrieval.windowed_index import WindowedIndex
 from uncertain_place_recognition.uncertainty import (
     feature_variance,
     mean_descriptor,
@@ -95,6 +97,10 @@ class PlaceRecognizer:
     Members of a shared-space ensemble speak one language: a place is their mean descriptor, and
     how far they disagree about a scan says how little it can be believed (thesis 4.2). Several
     threads may call it.
+
+    With an index that a fleet shares (`QdrantIndex`) answers also name places that other vehicles
+    added, by ids of their own (`elsewhere`); poses are then those that the others told, so all must
+    use one map frame. What is saved, loaded, moved, counted and forgotten are this vehicle's.
     """
 
     def __init__(
@@ -104,6 +110,7 @@ class PlaceRecognizer:
         judge: Judge | None = None,
         settings: PlaceRecognizerConfig | None = None,
         reduction: ReductionConfig | None = None,
+        index: IndexMaker | None = None,
         *,
         fingerprint: str,
     ) -> None:
@@ -115,12 +122,17 @@ class PlaceRecognizer:
             judge: says which matches to believe; None accepts none.
             settings: of answers and growth.
             reduction: of the clouds that are kept.
+            index: makes what searches the places; None: all are compared.
             fingerprint: hash of the weights (`weights_hash`); maps of others are refused.
+
+        Raises:
+            LocalizationError: there can be no such index (`IndexMaker.make`).
         """
         self.ensemble, self._submaps, self._judge = ensemble, submaps, judge
         self.fingerprint = fingerprint
         self.settings = settings or PlaceRecognizerConfig()
         self._reduction = reduction or ReductionConfig()
+        self._maker = index or IndexMaker()
         self._lock = threading.RLock()
         self.clear()
 
@@ -138,12 +150,18 @@ class PlaceRecognizer:
         return max(self._places, default=-1) + 1
 
     def clear(self) -> None:
-        """Forget all places."""
+        """Forget all places; what a shared map has taken in stays there."""
         with self._lock:
+            self._index = self._empty_index()
             self._places: dict[int, Place] = {}
             self._clouds: dict[int, CompactCloud] = {}
-            self._index = self._empty_index()
+            self._elsewhere: dict[int, FleetPlace] = {}
         self.start_drive()
+
+    def close(self) -> None:
+        """Let go of the folder or the connection of a shared map; nothing works afterwards."""
+        with self._lock:
+            self._index.close()
 
     def start_drive(self) -> None:
         """Forget what the last drive told about drift; places stay."""
@@ -162,25 +180,32 @@ class PlaceRecognizer:
         return members
 
     def locate(
-        self, scan: PointCloud | NDArray[np.float32], stamp_ns: int | None = None
+        self,
+        scan: PointCloud | NDArray[np.float32],
+        stamp_ns: int | None = None,
+        near: NDArray[np.float64] | None = None,
     ) -> PlaceAnswer:
         """Return the known places most like a scan.
 
         Args:
             scan: sweep in the base frame, or its embeddings (`embed`).
             stamp_ns: of the scan.
+            near: [2 or 3] where it was taken, as far as is known, metres in the map; an index that
+                divides the map by place may search only there.
 
         Raises:
             DataError: the scan cannot be embedded.
+            MapError: a shared map does not answer.
         """
         members = self._members(scan)
         raw = float(total_uncertainty(members, normalised=False))
         normalised = float(total_uncertainty(members, normalised=True))
         wanted = max(self.settings.matches, 0 if self._judge is None else self._judge.matches)
         with self._lock:
-            found = self._index.search(mean_descriptor(members), wanted, stamp_ns)
-            places = [self._places[int(id)] for id in found.place_id]
-            size = self._index.searchable
+            found = self._index.search(mean_descriptor(members), wanted, stamp_ns, near)
+            self._elsewhere.update(found.elsewhere)
+            places = [self.place(int(id)) for id in found.place_id]
+            size = self._index.searchable if found.searched is None else found.searched
         judgement = self._judged(found, places, normalised, size)
         return PlaceAnswer(
             tuple(
@@ -219,6 +244,7 @@ class PlaceRecognizer:
 
         Raises:
             DataError: the scan cannot be embedded, or the number is taken.
+            MapError: a shared map does not answer; the place is kept, and told when it does.
         """
         members = self._members(scan)
         kept = scan if isinstance(scan, PointCloud) else cloud
@@ -226,16 +252,31 @@ class PlaceRecognizer:
             id = self.next_id if id is None else int(id)
             if id in self._places:
                 raise DataError(f'place {id} is known already; choose another number')
-            self._index.add(id, mean_descriptor(members), stamp_ns)
             self._places[id] = Place(id, stamp_ns, T_map_base, covariance)
             if kept is not None and self.settings.keep_clouds:
                 self._clouds[id] = compact(reduce_cloud(kept, self._reduction))
+            try:
+                self._index.note_poses([self._places[id]])
+                self._index.add(id, mean_descriptor(members), stamp_ns)
+            except DataError:
+                del self._places[id]
+                self._clouds.pop(id, None)
+                raise
         return id
 
     def place(self, id: int) -> Place:
-        """Return a place; raises DataError when it is unknown."""
+        """Return a place, also one of another vehicle that was an answer; DataError if unknown."""
+        known = self._places.get(id)
+        return self.elsewhere(id).place if known is None else known
+
+    def elsewhere(self, id: int) -> FleetPlace:
+        """Return who added a place that was an answer and is not in this vehicle's map.
+
+        Raises:
+            DataError: there was none of that id.
+        """
         try:
-            return self._places[id]
+            return self._elsewhere[id]
         except KeyError:
             raise DataError(f'place {id} is not in the map') from None
 
@@ -250,12 +291,16 @@ class PlaceRecognizer:
         return None if kept is None else kept.cloud()
 
     def move(self, T_map_base: Mapping[int, se3.Array]) -> None:
-        """Correct the poses of places by their ids; unknown ones are left out."""
+        """Correct the poses of places by their ids; unknown ones are left out.
+
+        Raises:
+            MapError: a shared map does not answer; it is told when it does.
+        """
         with self._lock:
-            for id, T in T_map_base.items():
-                place = self._places.get(id)
-                if place is not None:
-                    self._places[id] = Place(id, place.stamp_ns, T, place.covariance)
+            known = [(self._places[id], T) for id, T in T_map_base.items() if id in self._places]
+            moved = [Place(p.id, p.stamp_ns, T, p.covariance) for p, T in known]
+            self._places |= {place.id: place for place in moved}
+            self._index.note_poses(moved)
 
     def save(self, path: str | Path) -> Path:
         """Write all places into a folder, the new ones too; return it.
@@ -278,14 +323,15 @@ class PlaceRecognizer:
         with self._lock:
             self._places = {place.id: place for place in saved.places}
             self._clouds = dict(saved.clouds)
+            self._elsewhere = {}
             self._index = index
         self.start_drive()
         return len(saved.places)
 
-    def _empty_index(self) -> ExactIndex:
+    def _empty_index(self) -> WindowedIndex:
         metric = 'cosine' if self._judge is None else self._judge.metric
         window = InsertionConfig(entries=self.settings.delay)
-        return ExactIndex(self.ensemble.length, metric, window)
+        return self._maker.make(self.ensemble.length, metric, window, self.fingerprint)
 
     def _members(self, scan: PointCloud | NDArray[np.float32]) -> NDArray[np.float32]:
         return self.embed(scan) if isinstance(scan, PointCloud) else scan

@@ -22,12 +22,11 @@ class InsertionConfig:
 
 @dataclass(frozen=True)
 class Entry:
-    """A descriptor [length] of a place, when it was seen and, for `QdrantIndex`, in which cell."""
+    """A descriptor [length] of a place, and when it was seen."""
 
     place_id: int
     descriptor: NDArray[np.float32]
     stamp_ns: int | None
-    cell: str = ''
 
 
 class InsertionWindow:

@@ -1,11 +1,14 @@
 """Say what every index of places can do, whichever engine answers."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from uncertain_place_recognition.retrieval.fleet_place import FleetPlace
 
 METRICS = ('cosine', 'euclidean')
 
@@ -18,11 +21,15 @@ class Neighbours:
         place_id: [K] int64.
         similarity: [K] cosine of descriptors (equation 22), -1 .. 1.
         distance: [K] Euclidean distance of descriptors.
+        elsewhere: those of them that are not in this vehicle's map, by their place_id.
+        searched: entries that were compared, where these are not all; None: all.
     """
 
     place_id: NDArray[np.int64]
     similarity: NDArray[np.float32]
     distance: NDArray[np.float32]
+    elsewhere: Mapping[int, FleetPlace] = field(default_factory=dict)
+    searched: int | None = None
 
     def __len__(self) -> int:
         return len(self.place_id)

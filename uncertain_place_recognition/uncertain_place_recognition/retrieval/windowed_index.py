@@ -1,13 +1,14 @@
 """What all indices share: entries are checked, kept back for a while, saved and loaded."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lcd_common.errors import ConfigError, DataError, MapError
+from uncertain_place_recognition.place import Place
 from uncertain_place_recognition.retrieval.descriptor_rows import (
     checked_descriptor,
     checked_metric,
@@ -55,6 +56,15 @@ class WindowedIndex(ABC):
     def __len__(self) -> int:
         return self.searchable + len(self._window)
 
+    def note_poses(self, places: Iterable[Place]) -> None:  # noqa: B027 - most keep none
+        """Note where places are, before they are added and when they move.
+
+        Only an engine that shares the map keeps them, and raises MapError when it cannot.
+        """
+
+    def close(self) -> None:  # noqa: B027 - most hold nothing
+        """Let go of a folder or a connection, where the engine has one."""
+
     def add(
         self, place_id: int, descriptor: NDArray[np.floating], stamp_ns: int | None = None
     ) -> None:
@@ -68,6 +78,13 @@ class WindowedIndex(ABC):
 
     def add_many(self, place_id: NDArray[np.integer], descriptors: NDArray[np.floating]) -> None:
         """Take in entries [K], [K x length] of an earlier drive; they are found at once."""
+        ids, rows = self._checked(place_id, descriptors)
+        if len(ids):
+            self._insert(ids, rows)
+
+    def _checked(
+        self, place_id: NDArray[np.integer], descriptors: NDArray[np.floating]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         ids = np.asarray(place_id, np.int64).ravel()
         rows = np.asarray(descriptors, np.float32)
         if rows.shape != (len(ids), self.length):
@@ -77,13 +94,18 @@ class WindowedIndex(ABC):
             )
         if not np.isfinite(rows).all():
             raise DataError('expected finite numbers in descriptors, got NaN or infinity')
-        if len(ids):
-            self._insert(ids, rows)
+        return ids, rows
 
     def search(
-        self, descriptor: NDArray[np.floating], k: int, stamp_ns: int | None = None
+        self,
+        descriptor: NDArray[np.floating],
+        k: int,
+        stamp_ns: int | None = None,
+        near: NDArray[np.float64] | None = None,
     ) -> Neighbours:
         """Return up to k places, best first; `stamp_ns` is now, None leaves waiting ones out.
+
+        An engine that divides the map by place may look only `near` [2 or 3], metres in the map.
 
         Raises:
             DataError: the descriptor has another length or is not finite.
@@ -118,6 +140,14 @@ class WindowedIndex(ABC):
         Raises:
             MapError: the file is none, or of another metric or length.
         """
+        self.add_many(*self.read(path))
+
+    def read(self, path: Path) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return ids [K] and rows [K x length] that `save` wrote, without taking them in.
+
+        Raises:
+            MapError: the file is none, or of another metric or length.
+        """
         try:
             with np.load(path, allow_pickle=False) as file:
                 version, metric = int(file['version']), str(file['metric'])
@@ -131,7 +161,7 @@ class WindowedIndex(ABC):
         if metric != self.metric:
             raise MapError(f'{path} ranks by {metric}, this index by {self.metric}; use {metric}')
         try:
-            self.add_many(ids, rows)
+            return self._checked(ids, rows)
         except DataError as error:
             raise MapError(f'{path}: {error}') from None
 
