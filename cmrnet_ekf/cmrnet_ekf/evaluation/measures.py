@@ -7,7 +7,7 @@ import numpy as np
 
 from cmrnet_ekf.calibration import AXES, ause, calibration, sharpness
 from cmrnet_ekf.evaluation.answers import Answers
-from cmrnet_ekf.rejection import accepted, traces
+from cmrnet_ekf.rejection import accepted, rejection_thresholds, traces
 from lcd_common.errors import DataError
 from lcd_common.se3 import Array
 
@@ -40,15 +40,23 @@ def of_uncertainty(answers: Answers) -> dict[str, dict[str, float]]:
 def after_rejection(answers: Answers, share: float = SHARE) -> dict[str, float]:
     """Return the errors of what is kept, and the share of what is discarded (Table 5.4).
 
-    Discarded is what has either trace, of translation or of rotation, in the top share.
+    Discarded is what has either trace, of translation or of rotation, in the top share. The traces
+    from which on it is are given by the names of map_registration's parameters.
 
     Raises:
         DataError: nothing is left.
     """
-    keep = accepted(traces(answers.belief), share)
+    found = traces(answers.belief)
+    limits = rejection_thresholds(found, share)
+    keep = accepted(found, thresholds=limits)
     if not keep.any():
         raise DataError(f'nothing is left of {len(keep)} samples: judge more of them')
-    return {**asdict(answers.summary(keep)), 'discarded_share': float(1.0 - keep.mean())}
+    return {
+        **asdict(answers.summary(keep)),
+        'discarded_share': float(1.0 - keep.mean()),
+        'max_trace_translation': float(limits[0]),
+        'max_trace_rotation': float(limits[1]),
+    }
 
 
 def by_confidence(answers: Answers) -> dict[str, list[float]]:

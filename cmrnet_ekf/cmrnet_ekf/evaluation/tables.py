@@ -97,8 +97,12 @@ def _sharpness(figures: Mapping[str, Any]) -> str:
 def _rejection(figures: Mapping[str, Any]) -> str:
     found = figures['rejection']
     header = ['', 't median [m]', 't mean ± std', 't p95', 'r median [°]', 'r mean ± std', 'r p95']
-    rows = [[n, *_errors(e), f'{e["discarded_share"]:.1%}'] for n, e in found.items()]
-    return table([*header, '> 1 m', '> 4 m', 'discarded'], rows)
+    limits = 'max_trace_translation', 'max_trace_rotation'
+    rows = [
+        [n, *_errors(e), f'{e["discarded_share"]:.1%}', *(f'{e[limit]:.3g}' for limit in limits)]
+        for n, e in found.items()
+    ]
+    return table([*header, '> 1 m', '> 4 m', 'discarded', *limits], rows)
 
 
 def _both(figures: Mapping[str, Any]) -> str:

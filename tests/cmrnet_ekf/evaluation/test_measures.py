@@ -59,6 +59,10 @@ def test_rejection_is_by_either_trace():
     assert found['discarded_share'] == pytest.approx(top.mean())
     assert found['t_mean_m'] == pytest.approx(metres[~top].mean())
     assert found['count'] == (~top).sum()
+    # As map_registration compares: above these is rejected.
+    limits = found['max_trace_translation'], found['max_trace_rotation']
+    above = (of[0] > limits[0]) | (of[1] > limits[1])
+    np.testing.assert_array_equal(above, top)
     assert found['t_mean_m'] < metres.mean(), 'larger scales, larger errors'
     curve = measures.by_confidence(answers)
     assert curve['t_mean_m'][0] == pytest.approx(metres.mean())
