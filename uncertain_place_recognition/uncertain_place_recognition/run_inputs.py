@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from uncertain_place_recognition.ensemble import EmbeddingEnsemble
 
 _BATCH = 16
+_METRIC = 'metric'  # what no run says: submaps of live sweeps
+_NO_LOOKS = ('fewest',)  # says when there is no submap, not how one looks
 ROLES = ('teacher', 'students', 'naive', 'dropout', 'stun')
 
 
@@ -81,9 +83,15 @@ def load_embedded(
 
 
 def embed_submaps(run: SubmapRun, ensembles: 'Mapping[str, EmbeddingEnsemble]') -> EmbeddedRun:
-    """Return the embeddings of a run by all ensembles, and which weights made them."""
+    """Return the embeddings of a run by all ensembles, and which weights made them.
+
+    Raises:
+        DataError: an ensemble was trained on submaps that were made in another way.
+    """
     from uncertain_place_recognition.weights_hash import weights_hash
 
+    for role, ensemble in ensembles.items():
+        _compare(run, role, ensemble.facts)
     members: dict[str, NDArray[np.float32]] = {}
     for role, ensemble in ensembles.items():
         if role == 'stun':
@@ -103,6 +111,30 @@ def embed_submaps(run: SubmapRun, ensembles: 'Mapping[str, EmbeddingEnsemble]') 
     hashes = {role: weights_hash(ensemble.members) for role, ensemble in ensembles.items()}
     facts = {**run.facts, 'weights': hashes}
     return EmbeddedRun(run.name, run.world, run.stamps_ns, run.positions, members, facts)
+
+
+def _compare(run: SubmapRun, role: str, weights: Mapping[str, Any]) -> None:
+    """Raise DataError where a run's submaps are not made as those that weights were trained on."""
+    mine, theirs = (facts.get('normalisation', _METRIC) for facts in (run.facts, weights))
+    if mine != theirs:
+        raise DataError(
+            f'run {run.name} has submaps of the normalisation {mine}, the weights of {role} know '
+            f'{theirs} ones: embed it by weights that were trained on such'
+        )
+    told = weights.get('submap')
+    if told is None or mine != _METRIC:
+        return
+    made = run.facts.get('submap') or {'points': run.points.shape[1]}
+    differ = [
+        f'{name} {made[name]} (weights: {value})'
+        for name, value in told.items()
+        if name in made and name not in _NO_LOOKS and made[name] != value
+    ]
+    if differ:
+        raise DataError(
+            f'run {run.name} has submaps made otherwise than those of {role}: {", ".join(differ)}; '
+            'make it anew with make_submap_runs --submap and the settings of the weights'
+        )
 
 
 def weights_of(runs: Sequence[EmbeddedRun], role: str) -> str:
