@@ -57,3 +57,22 @@ def test_stored_sweeps_and_mistakes(tmp_path, capsys):
     assert 'town:SEED' in errors[1]
     with pytest.raises(ConfigError, match='no town style'):
         simulated_drive(200, style='marble')
+
+
+def test_every_setting_of_submaps_can_be_changed(tmp_path, capsys):
+    wall = np.random.default_rng(0).uniform([-20, 4, 0], [20, 5, 6], (3000, 3))
+    with SweepWriter(tmp_path / 'drive', 'town_3_run0', {}) as writer:
+        writer.add(1000, PointCloud(wall.astype(np.float32)), np.eye(4))
+    given = [str(tmp_path / 'drive'), '--out', str(tmp_path / 'runs'), '--quiet', '--points', '128']
+    assert main([*given, '--submap', 'reach=12', 'near=5', 'ground=0', 'fewest=50']) == 0
+    run = SubmapRun.load(tmp_path / 'runs' / 'town_3_run0.npz')
+    assert run.facts['submap'] == {
+        'points': 128, 'reach': 12.0, 'near': 5.0, 'ground': 0.0, 'top': 30.0, 'fewest': 50,
+    }  # fmt: skip
+    metres = 12.0 * run.points[0].astype(np.float32)
+    assert np.abs(metres[:, :2]).max() <= 12.01
+    assert np.hypot(metres[:, 0], metres[:, 1]).min() > 4.9
+    assert main([*given, '--submap', 'reech=12']) == 1
+    assert 'NAME one of: fewest, ground, near, points, reach, top' in capsys.readouterr().err
+    assert main([*given, '--submap', 'reach=1']) == 1
+    assert 'reach must be at least 5 m' in capsys.readouterr().err

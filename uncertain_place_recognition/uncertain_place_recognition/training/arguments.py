@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from uncertain_place_recognition.networks.shapes import NETWORKS
+from uncertain_place_recognition.training.validation import RADIUS_M
 
 _EXAMPLES = """
 examples:
@@ -18,6 +19,8 @@ examples:
   train_place_recognition student --teacher shared/teacher --seed 9 ... --out shared/student_9
   train_place_recognition student --teacher naive/ensemble.safetensors --seed 9 ... --out mean_9
       the mean of several teachers is learnt, which recognises more than each
+  train_place_recognition teacher --pairs positive=5 negative=20 --validation-radius 10 ...
+      radii for smaller submaps
   train_place_recognition stun --teacher shared/teacher ... --out stun
   train_place_recognition dropout --rate 0.5 ... --out dropout
   train_place_recognition teacher --preset original --device cuda \\
@@ -113,6 +116,10 @@ def _validation(parser: argparse.ArgumentParser, required: bool) -> None:
         '--validation', nargs='+', type=Path, required=required, default=[], help='runs to judge by'
     )
     add('--validation-submaps', type=int, default=250, help='of a run, at most (default: 250)')
+    add(
+        '--validation-radius', type=float, default=RADIUS_M, metavar='M',
+        help=f'matches nearer than this are right, m (default: {RADIUS_M:g})',
+    )  # fmt: skip
 
 
 def _machine(parser: argparse.ArgumentParser) -> None:

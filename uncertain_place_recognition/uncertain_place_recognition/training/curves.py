@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_place_recognition.training.optional import has_matplotlib
+
 
 def draw_curves(folder: Path) -> None:
-    """Draw training.jsonl and validation.jsonl of a folder into curves.png."""
+    """Draw training.jsonl and validation.jsonl of a folder into curves.png, given matplotlib."""
+    if not has_matplotlib():
+        return
     import matplotlib
 
     matplotlib.use('Agg')

@@ -16,7 +16,7 @@ from uncertain_place_recognition.networks.weights import save_networks
 from uncertain_place_recognition.runs import SubmapRun
 from uncertain_place_recognition.training.curves import draw_curves, rows
 from uncertain_place_recognition.training.embedded_runs import embed_runs
-from uncertain_place_recognition.training.validation import recall
+from uncertain_place_recognition.training.validation import RADIUS_M, recall
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,11 @@ class Judge:
         facts: dict[str, Any],
         teacher: PlaceNetwork | None = None,
         device: torch.device | str = 'cpu',
+        radius: float = RADIUS_M,
     ) -> None:
-        """Take the folder, the validation runs, facts for the card, and the teacher if any."""
-        self.folder, self._runs, self._facts, self._device = folder, runs, facts, device
+        """Take a folder, runs to validate on, facts for the card, a teacher, and what is near."""
+        self.folder, self._runs, self._device, self._radius = folder, runs, device, radius
+        self._facts = {**facts, 'validation_radius_m': radius}
         self._targets: list[NDArray[np.float32]] | None = None
         if teacher is not None:
             self._targets = embed_runs(teacher.to(device), runs, device)
@@ -76,10 +78,10 @@ class Judge:
 
     def _judged(self, network: PlaceNetwork, step: int) -> Judgement:
         mine = embed_runs(network, self._runs, self._device)
-        own = recall(self._runs, mine, mine)
+        own = recall(self._runs, mine, mine, self._radius)
         if self._targets is None:
             return Judgement(step, own.recall_1, own.queries)
-        theirs = recall(self._runs, self._targets, mine)
+        theirs = recall(self._runs, self._targets, mine, self._radius)
         target = np.concatenate(self._targets)
         apart = np.linalg.norm(np.concatenate(mine) - target, axis=1).mean()
         spread = np.linalg.norm(target - target.mean(axis=0), axis=1).mean()

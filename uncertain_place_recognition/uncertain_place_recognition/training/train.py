@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from lcd_common.command_line import run
 from lcd_common.device import choose_device
@@ -23,9 +22,11 @@ from uncertain_place_recognition.networks.weights import load_networks
 from uncertain_place_recognition.runs import SubmapRun, load_runs
 from uncertain_place_recognition.training.arguments import parser
 from uncertain_place_recognition.training.augmentation import AugmentationConfig
+from uncertain_place_recognition.training.curves import draw_curves
 from uncertain_place_recognition.training.embedded_runs import embed_runs, thinned_run
 from uncertain_place_recognition.training.judge import Judge, Judgement
 from uncertain_place_recognition.training.mean_teacher import MeanTeacher
+from uncertain_place_recognition.training.optional import progress_bar
 from uncertain_place_recognition.training.pairs import PairConfig
 from uncertain_place_recognition.training.trainer import Trainer, TrainingConfig
 from uncertain_place_recognition.training.validation import Interchange, interchange
@@ -133,13 +134,12 @@ def _train(
         'parameters': sum(p.numel() for p in network.parameters()),
         'torch': torch.__version__,
     }
-    judge = Judge(out, data.validation, facts, teacher, device)
+    judge = Judge(out, data.validation, facts, teacher, device, arguments.validation_radius)
     deadline = None if arguments.minutes is None else time.monotonic() + 60.0 * arguments.minutes
     every = arguments.validate_every or max(1, training.steps // 8)
     begin = trainer.step
     shown: Judgement | None = None
-    with tqdm(total=training.steps, initial=trainer.step, unit='step', desc=out.name,
-              disable=arguments.quiet) as bar:  # fmt: skip
+    with progress_bar(training.steps, trainer.step, out.name, arguments.quiet) as bar:
         for record in trainer.run(deadline=deadline):
             bar.update()
             if record.step % every == 0 or record.step == training.steps:
@@ -151,6 +151,8 @@ def _train(
         sys.stdout.write(f'{out}: step {trainer.step} of {training.steps}, {_told(shown)}\n')
     else:
         state = 'trained already' if trainer.step == training.steps else 'no time for a step'
+        if trainer.step and not (out / 'curves.png').exists():
+            draw_curves(out)  # trained where nothing can draw
         sys.stdout.write(f'{out}: {state}, step {trainer.step} of {training.steps}\n')
     return trainer.step == training.steps
 
@@ -199,7 +201,7 @@ def _pack(files: Sequence[Path], out: Path, arguments: argparse.Namespace) -> No
     if runs:
         device = choose_device(arguments.device)
         found_all = [embed_runs(one.to(device), runs, device) for one in members]
-        judged = interchange(runs, found_all)
+        judged = interchange(runs, found_all, arguments.validation_radius)
         sys.stdout.write(_table(judged))
         ensemble.facts['interchange'] = {
             'recall_1': judged.recall_1.round(4).tolist(),
@@ -215,7 +217,7 @@ def _pack(files: Sequence[Path], out: Path, arguments: argparse.Namespace) -> No
 def _data(arguments: argparse.Namespace) -> _Data:
     training, validation = load_runs(arguments.runs), load_runs(arguments.validation)
     shared = {one.world for one in training} & {one.world for one in validation}
-    if shared:
+    if shared and not _parted(training, validation):
         raise DataError(
             f'{", ".join(sorted(shared))} is in the runs for training and for validation; keep '
             'towns apart'
@@ -232,6 +234,14 @@ def _data(arguments: argparse.Namespace) -> _Data:
         )
     thin = [thinned_run(one, arguments.validation_submaps) for one in validation]
     return _Data(training, thin, told[0])
+
+
+def _parted(training: Sequence[SubmapRun], validation: Sequence[SubmapRun]) -> bool:
+    """Tell whether runs for training lie outside the benchmark's test regions, others inside."""
+    out, inside = ({one.facts.get('region', '') for one in runs} for runs in (training, validation))
+    kinds = [{text.partition(' ')[0] for text in found} for found in (out, inside)]
+    sites = {text.partition(' ')[2] for text in out | inside}
+    return kinds == [{'outside'}, {'inside'}] and len(sites) == 1
 
 
 def _teacher(path: Path) -> tuple[PlaceNetwork, dict[str, Any]]:

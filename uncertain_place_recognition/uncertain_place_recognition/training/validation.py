@@ -10,7 +10,7 @@ from lcd_common.errors import DataError
 from uncertain_place_recognition.runs import SubmapRun
 from uncertain_place_recognition.uncertainty import total_uncertainty
 
-_RADIUS_M = 25.0  # of a true match, as in the benchmark
+RADIUS_M = 25.0  # of a true match, as in the benchmark
 _GAP_NS = 30_000_000_000
 
 Embeddings = Sequence[NDArray[np.float32]]
@@ -31,12 +31,17 @@ class Recall:
     chance: float
 
 
-def recall(runs: Sequence[SubmapRun], database: Embeddings, queries: Embeddings) -> Recall:
+def recall(
+    runs: Sequence[SubmapRun],
+    database: Embeddings,
+    queries: Embeddings,
+    radius: float = RADIUS_M,
+) -> Recall:
     """Return how often the nearest embedding is a true match.
 
     Every submap asks among all others, of other runs and of its own run at least 30 s away; a
-    true match lies within 25 m in the same world. Submaps without one are left out. Database and
-    queries [N x D] of each run may come from two networks.
+    true match lies within the radius [m] in the same world. Submaps without one are left out.
+    Database and queries [N x D] of each run may come from two networks.
 
     Raises:
         DataError: no submap has a true match.
@@ -51,7 +56,7 @@ def recall(runs: Sequence[SubmapRun], database: Embeddings, queries: Embeddings)
     for k, (run, asking) in enumerate(zip(runs, queries, strict=True)):
         allowed = (number != k) | (np.abs(stamp - run.stamps_ns[:, None]) >= _GAP_NS)
         distance = np.linalg.norm(run.positions[:, None] - xy, axis=2)
-        true = allowed & (worlds[number] == run.world) & (distance <= _RADIUS_M)
+        true = allowed & (worlds[number] == run.world) & (distance <= radius)
         asked = true.any(axis=1)
         if not asked.any():
             continue
@@ -63,7 +68,7 @@ def recall(runs: Sequence[SubmapRun], database: Embeddings, queries: Embeddings)
         total += int(asked.sum())
     if not shares:
         raise DataError(
-            f'no submap of {len(runs)} validation runs has a true match within {_RADIUS_M:g} m: '
+            f'no submap of {len(runs)} validation runs has a true match within {radius:g} m: '
             'give two runs of each world'
         )
     return Recall(float(np.mean(shares)), total, float(np.mean(chances)))
@@ -95,13 +100,15 @@ class Interchange:
         return float(self.recall_1[mask].mean()) if mask.any() else self.diagonal
 
 
-def interchange(runs: Sequence[SubmapRun], members: Sequence[Embeddings]) -> Interchange:
+def interchange(
+    runs: Sequence[SubmapRun], members: Sequence[Embeddings], radius: float = RADIUS_M
+) -> Interchange:
     """Return how well members [M] understand one another, from their embeddings of each run."""
     table = np.zeros((len(members), len(members)))
     chance = 0.0
     for row, database in enumerate(members):
         for column, queries in enumerate(members):
-            found = recall(runs, database, queries)
+            found = recall(runs, database, queries, radius)
             table[row, column], chance = found.recall_1, found.chance
     stacked = np.stack([np.concatenate(list(one)) for one in members], axis=1)
     return Interchange(table, chance, float(np.mean(total_uncertainty(stacked, normalised=True))))
