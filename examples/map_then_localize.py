@@ -2,11 +2,13 @@
 
     bags simulate --town 100 --length 300 --camera --imu --out drive.mcap
     python examples/map_then_localize.py drive.mcap --out mapped
+    python examples/map_then_localize.py drive.mcap --map mapped --start 15    # the same map again
 
 First pass: the pose graph places the sweeps, which become a LiDAR map, and place recognition
 remembers its places. Second pass, from --start on: place recognition finds where the vehicle is,
 map_registration refines that by each camera image, ekf fuses it with the IMU and owns
 map -> base_link. Needs points, camera and imu; prints how far the second pass is off the first.
+How well the camera holds the vehicle is a matter of its network (--weights).
 """
 
 import argparse
@@ -34,15 +36,23 @@ from lcd_common import command_line, se3
 from lcd_common.errors import DataError
 from lcd_common.nodes import messages
 from lcd_common.nodes.parameters import overrides
-from lcd_common.trajectory import Trajectory
+from lcd_common.trajectory import Trajectory, read_tum
 from lcd_loop_closure.nodes.lidar_odometry_node import LidarOdometryNode
 from lcd_loop_closure.nodes.loop_closure_node import LoopClosureNode
 from lcd_loop_closure.nodes.pose_graph_node import PoseGraphNode
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 
+POSES = 'poses.tum'  # of the mapped drive, beside tiles and places
+
 
 def build(drive: Drive, out: Path) -> Trajectory:
-    """Map a drive into out/tiles and out/places; return where its keyframes are in the map."""
+    """Map a drive into out/tiles and out/places; return where its keyframes are in the map.
+
+    Raises:
+        DataError: out holds something: a map would grow by a second copy of the drive.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f'{out}: is there already; --map {out} uses its map, or name a new --out')
     inside = {'parameter_overrides': overrides(threaded=False)}
     places = PlaceRecognitionNode(parameter_overrides=overrides(threaded=False, follow='keyframes'))
     graph = PoseGraphNode(**inside)
@@ -53,6 +63,7 @@ def build(drive: Drive, out: Path) -> Trajectory:
     for sweep in tqdm(drive_sweeps(drive, poses, every=2), 'LiDAR map', unit='sweep'):
         builder.add(sweep.cloud, sweep.T_map_base, sweep.T_base_sensor, sweep.moving)
     builder.finish()
+    poses.write_tum(out / POSES)
     return poses
 
 
@@ -74,7 +85,8 @@ def localize(drive: Drive, out: Path, start_s: float, weights: str) -> list[tupl
     # LiDAR odometry only serves place recognition: ekf lives by camera and IMU.
     alone = overrides(odometry='', fixes='', start_from='set_pose')
     nodes = [
-        LidarOdometryNode(parameter_overrides=overrides(**inside)),
+        # base_link has one parent, and that edge is ekf's.
+        LidarOdometryNode(parameter_overrides=overrides(publish_tf=False, **inside)),
         PlaceRecognitionNode(parameter_overrides=known),
         MapRegistrationNode(parameter_overrides=camera),
         EkfNode(parameter_overrides=alone),
@@ -98,14 +110,14 @@ def _replay(nodes: Sequence[Any], drive: Drive, start_s: float = 0.0, listened: 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do both passes and say how well they agree."""
+    """Do both passes, or the second in an earlier map, and say how well they agree."""
     drive = open_input(options.source)
     if drive.camera is None:
         raise DataError(f'{options.source}: has no camera; bags simulate --camera --imu makes one')
     rclpy.init(args=[])
     try:
-        poses = build(drive, options.out)
-        found = localize(drive, options.out, options.start, options.weights)
+        poses = read_tum(options.map / POSES) if options.map else build(drive, options.out)
+        found = localize(drive, options.map or options.out, options.start, options.weights)
     finally:
         rclpy.try_shutdown()
     mapped = [(T, poses.at(stamp_ns)) for stamp_ns, T in found]
@@ -125,7 +137,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('source', help='bag or data set folder with points, camera and imu')
-    parser.add_argument('--out', type=Path, required=True, help='new folder for map and places')
+    folder = parser.add_mutually_exclusive_group(required=True)
+    folder.add_argument('--out', type=Path, help='new folder for map and places')
+    folder.add_argument(
+        '--map', type=Path, help='--out of an earlier run of this drive: no mapping'
+    )
     parser.add_argument(
         '--start', type=float, default=10.0, metavar='S', help='of the second pass (default: 10)'
     )

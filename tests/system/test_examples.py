@@ -1,13 +1,19 @@
 """Run the examples as a user does."""
 
+import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from bags.simulation.drive import SensorsConfig, SimulatedDrive
+from bags.simulation.itinerary import JourneyConfig
 
 pytestmark = pytest.mark.ros
 EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
@@ -20,7 +26,7 @@ def _run(*words: str) -> 'subprocess.CompletedProcess[str]':
 
 
 def test_examples_are_short() -> None:
-    longer = {'map_then_localize.py': 150}  # three parts of the suite, twice through a drive
+    longer = {'map_then_localize.py': 160}  # three parts of the suite, twice through a drive
     for path in EXAMPLES.glob('*.py'):
         assert len(path.read_text().splitlines()) <= longer.get(path.name, 60), path.name
 
@@ -50,6 +56,58 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert run.returncode == 1
     assert 'nothing does not exist: train an ensemble' in run.stderr
     assert 'Traceback' not in run.stderr
+
+
+@pytest.fixture
+def example(ros: None, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Import map_then_localize, with 50 m of a town for a recording: images cost time."""
+    path = EXAMPLES / 'map_then_localize.py'
+    spec = importlib.util.spec_from_file_location('map_then_localize', path)
+    assert spec is not None and spec.loader is not None
+    module: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    sensors = SensorsConfig(lidar='vlp16', camera=True, gnss=False)
+    drive = SimulatedDrive(100, 0, JourneyConfig(length=50.0), sensors)
+    monkeypatch.setattr(module, 'open_input', lambda source: drive)
+    # The session's context serves.
+    monkeypatch.setattr(module.rclpy, 'init', lambda **options: None)
+    monkeypatch.setattr(module.rclpy, 'try_shutdown', lambda: None)
+    return module
+
+
+def test_a_mapped_drive_is_found_and_tracked_and_its_map_used_again(
+    example: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    localized = []
+    localize = example.localize
+
+    def remembered(*given: Any) -> Any:
+        localized.append((given, localize(*given)))
+        return localized[-1][1]
+
+    monkeypatch.setattr(example, 'localize', remembered)
+    out = tmp_path / 'mapped'
+    assert example.main(['drive', '--out', str(out), '--start', '9']) == 0
+    said, logged = capfd.readouterr()
+    assert 'found by place recognition at' in said
+    assert 'on /tf' not in logged, 'base_link has one parent'
+    result = re.search(r'(\d+) poses by camera and IMU; .* median ([\d.]+) m', said)
+    assert result is not None and int(result[1]) > 50
+    assert float(result[2]) < 10.0, 'how near is a matter of the network'
+    assert {p.name for p in out.iterdir()} == {'tiles', 'places', 'poses.tum'}
+
+    assert example.main(['drive', '--out', str(out)]) == 1
+    assert f'--map {out} uses its map' in capfd.readouterr().err
+    (_, found), made = localized[0], (out / 'poses.tum').stat().st_mtime_ns
+    monkeypatch.setattr(example, 'localize', lambda *given: (localized.append(given), found)[1])
+    assert example.main(['drive', '--map', str(out), '--start', '9']) == 0
+    _, folder, *rest = localized[1]
+    assert folder == out and rest == [9.0, '']
+    again = capfd.readouterr().out
+    assert again.splitlines()[-1] == said.splitlines()[-1]
+    assert (out / 'poses.tum').stat().st_mtime_ns == made
+    assert example.main(['drive', '--map', str(tmp_path / 'none')]) == 1
+    assert 'poses.tum: No such file' in capfd.readouterr().err
 
 
 def test_the_composed_nodes_come_up_and_end_with_ctrl_c(ros: None) -> None:
