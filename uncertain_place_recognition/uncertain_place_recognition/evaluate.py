@@ -28,16 +28,16 @@ examples:
       students=weights/students naive=weights/triplet dropout=weights/dropout stun=weights/stun \\
       --save-embeddings embedded/town --out results/town
   evaluate_place_recognition embedded/town --metric euclidean --out results/town_euclidean
-  evaluate_place_recognition --database runs/DCC01.npz --queries runs/DCC02.npz \\
-      --ensemble weights --out results/mulran          MulRan: one run is the map, another one asks
+  evaluate_place_recognition --ensemble weights --out results/mulran \\
+      --database runs/mulran_DCC01.npz --queries runs/mulran_DCC02.npz
   evaluate_place_recognition runs/oxford --query-region oxford --metric euclidean \\
       --ensemble weights --out results/oxford          the PointNetVLAD benchmark's test regions
   evaluate_place_recognition embedded/town --calibration weights/calibration.json --open-set \\
       --no-match 0.3 --out results/town_open
 
 Every run is searched in every other run of its world; runs of --database only are searched, those
-of --queries only ask. A match within --radius is right; recall
-leaves out queries whose place the other run does not have, and is a plain mean over pairs of runs.
+of --queries only ask. A match within --radius is right; recall leaves out queries whose place the
+other run does not have, and is a plain mean over pairs of runs.
 Roles: teacher (one network), students (of one feature space), naive (networks trained apart, also
 searched one by one as Mason et al. do), dropout (passes with dropout), stun (predicts a variance).
 """
