@@ -38,7 +38,7 @@ def test_tiles_near_a_position_are_searched_alone_and_together():
     add(index, place(3, x=50.0, y=150.0), [0.8, 0.2])
     query = np.array([1.0, 0.0])
     assert index.search(query, 3).place_id.tolist() == [1, 2, 3], 'no position: all of them'
-    assert index.search(query, 3).searched is None
+    assert index.search(query, 3).searched == 3
     only = index.search(query, 3, near=np.array([-50.0, 10.0]))
     assert only.place_id.tolist() == [2] and only.searched == 1
     assert index.search(query, 3, near=np.array([10.0, 50.0])).place_id.tolist() == [1, 2]

@@ -22,7 +22,7 @@ class Neighbours:
         similarity: [K] cosine of descriptors (equation 22), -1 .. 1.
         distance: [K] Euclidean distance of descriptors.
         elsewhere: those of them that are not in this vehicle's map, by their place_id.
-        searched: entries that were compared, where these are not all; None: all.
+        searched: entries that were looked through, where the engine says so.
     """
 
     place_id: NDArray[np.int64]

@@ -119,6 +119,7 @@ class QdrantIndex(WindowedIndex):
         self._unsent: dict[str, tuple[int, NDArray[np.float32]]] = {}
         self._moved: dict[str, Place] = {}
         self._damaged: set[str] = set()
+        self._tiles: list[str] = []  # of the search that goes on; empty: all
         with self._asking():
             self._open()
 
@@ -158,13 +159,14 @@ class QdrantIndex(WindowedIndex):
             MapError: the server does not answer.
         """
         s = self.settings
-        self._send()
-        if near is None or not s.radius:
-            return super().search(descriptor, k, stamp_ns)
         row = checked_descriptor(descriptor, self.length)
         self._insert_entries(self._window.release(stamp_ns))
-        tiles = tiles_around(float(near[0]), float(near[1]), s.radius, s.tile)
-        return replace(self._nearest_in(row, k, tiles), searched=self._count(tiles))
+        self._send()
+        tiles: list[str] = []
+        if near is not None and s.radius:
+            tiles = tiles_around(float(near[0]), float(near[1]), s.radius, s.tile)
+        self._tiles = tiles
+        return replace(self._nearest(row, k), searched=self._count(tiles))
 
     def _insert(self, place_id: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
         for number, row in zip(place_id.tolist(), rows, strict=True):
@@ -174,15 +176,12 @@ class QdrantIndex(WindowedIndex):
         self._send()
 
     def _nearest(self, query: NDArray[np.float32], k: int) -> Neighbours:
-        return self._nearest_in(query, k, ())
-
-    def _nearest_in(self, query: NDArray[np.float32], k: int, tiles: Sequence[str]) -> Neighbours:
         with self._asking():
             points = self._client.query_points(
                 self.settings.collection,
                 query=query.tolist(),
                 limit=_RERANKED * max(k, 1),
-                query_filter=self._among(tiles),
+                query_filter=self._among(self._tiles),
                 with_vectors=True,
             ).points
         elsewhere = {key: found for key, found in map(self._read_elsewhere, points) if found}
@@ -191,7 +190,7 @@ class QdrantIndex(WindowedIndex):
         ids = [elsewhere[k].place.id if k in elsewhere else self._own[k] for k in keys]
         rows = DescriptorRows(self.length, len(points))
         rows.append(np.array(ids, np.int64), self._rows(points))
-        best = rows.ranked(query, np.arange(len(rows)), k, self.metric)
+        best = rows.ranked(query, np.arange(len(rows)), max(k, 0), self.metric)
         kept = set(best.place_id.tolist())
         by_id = {found.place.id: found for found in elsewhere.values()}
         return replace(best, elsewhere={id: by_id[id] for id in by_id.keys() & kept})
