@@ -11,10 +11,12 @@ from lcd_common.nodes import messages
 from lcd_msgs.msg import PlaceMatch, PlaceMatchArray
 from uncertain_place_recognition.place import Match, PlaceAnswer
 from uncertain_place_recognition.relocalizer import Relocalized
+from uncertain_place_recognition.retrieval.fleet_place import is_elsewhere
 
 _GREEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=0.9)
 _RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.6)
 _GREY = ColorRGBA(r=0.6, g=0.6, b=0.6, a=0.6)
+_ELSEWHERE, _LOW_BITS = 2**31, 2**31 - 1
 
 
 def matches_message(answer: PlaceAnswer, header: Header) -> PlaceMatchArray:
@@ -28,10 +30,19 @@ def matches_message(answer: PlaceAnswer, header: Header) -> PlaceMatchArray:
     )
 
 
+def message_id(place_id: int) -> int:
+    """Return the id of a place in 32 bits; of places in other vehicles' maps from 2^31 upwards.
+
+    Those keep 31 bits of their id: enough to tell the matches of an answer apart, not a fleet's
+    places.
+    """
+    return _ELSEWHERE | (place_id & _LOW_BITS) if is_elsewhere(place_id) else place_id
+
+
 def _match_message(match: Match, answer: PlaceAnswer) -> PlaceMatch:
     probability = None if answer.withdrawn else match.false_match_probability
     return PlaceMatch(
-        place_id=match.place_id,
+        place_id=message_id(match.place_id),
         pose=messages.pose_with_covariance(match.T_map_base, match.covariance),
         similarity=match.similarity,
         uncertainty=answer.uncertainty,
@@ -86,5 +97,5 @@ def answer_markers(
 
 def _caption(best: Match, answer: PlaceAnswer) -> str:
     if answer.withdrawn or best.false_match_probability is None:
-        return f'place {best.place_id}, u {answer.uncertainty_normalised:.3f}'
-    return f'place {best.place_id}, {best.false_match_probability:.1%} wrong'
+        return f'place {message_id(best.place_id)}, u {answer.uncertainty_normalised:.3f}'
+    return f'place {message_id(best.place_id)}, {best.false_match_probability:.1%} wrong'

@@ -53,15 +53,15 @@ from lcd_loop_closure.reduction import ReductionConfig
 from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import PlaceMatchArray
 from uncertain_place_recognition.drive_places import DrivePlaces
+from uncertain_place_recognition.nodes.answer_watch import AnswerWatch
+from uncertain_place_recognition.nodes.declared_recognizer import declared_recognizer
 from uncertain_place_recognition.nodes.place_messages import (
     answer_markers,
     initial_pose_message,
     matches_message,
 )
 from uncertain_place_recognition.nodes.place_services import PlaceServices
-from uncertain_place_recognition.opened import open_recognizer
 from uncertain_place_recognition.place import PlaceAnswer
-from uncertain_place_recognition.place_recognizer import PlaceRecognizerConfig
 from uncertain_place_recognition.relocalizer import RelocalizerConfig
 from uncertain_place_recognition.scan_keyframes import KeyframeStamp, ScanKeyframes
 
@@ -126,12 +126,9 @@ class PlaceRecognitionNode(Node):
         self._relocalizer = declare_config(self, RelocalizerConfig, 'relocalizer')
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
-        self.recognizer = open_recognizer(
-            self.config.weights,
-            self.config.calibration,
-            declare_config(self, PlaceRecognizerConfig, 'recognizer'),
-            self._reduction,
-            self.config.device,
+        weights, calibration = self.config.weights, self.config.calibration
+        self.recognizer = declared_recognizer(
+            self, weights, calibration, self._reduction, self.config.device
         )
         self.get_logger().info(f'the networks run on {choose_device(self.config.device)}')
         self.diagnostics = Diagnostics(self)
@@ -169,8 +166,7 @@ class PlaceRecognitionNode(Node):
                 PointCloud2, 'graph/keyframes', self.on_graph_keyframes, qos.LATCHED
             )
         self.place_services = PlaceServices(self, threaded=self.config.threaded)
-        self.diagnostics.watch('places', lambda: len(self.recognizer))
-        self.diagnostics.watch('places that can be answered', lambda: self.recognizer.searchable)
+        self._answer_watch = AnswerWatch(self.diagnostics, lambda: len(self.recognizer))
         self.diagnostics.watch('scans waiting', self._scans.waiting)
 
     def on_points(self, message: PointCloud2) -> None:
@@ -275,6 +271,7 @@ class PlaceRecognitionNode(Node):
         """Stop the workers, then the node."""
         self._scans.stop()
         self._corrections.stop()
+        self.recognizer.close()
         super().destroy_node()
 
     def _rewind(self, stamp_ns: int) -> None:
@@ -322,7 +319,9 @@ class PlaceRecognitionNode(Node):
             self._reject('points', 'no submap', str(error))
             return
         with self.diagnostics.stage('search'):
-            answer = self.recognizer.locate(members, stamp_ns)
+            T_map_base = drive.T_map_base(scan.pose.T_odom_base, scan.keyframe_id)
+            near = None if T_map_base is None else T_map_base[:3, 3]
+            answer = self.recognizer.locate(members, stamp_ns, near)
         self._publish(answer, scan)
         origin = scan.T_base_lidar[:3, 3]
         with self.diagnostics.stage('relocalize'):
@@ -352,6 +351,7 @@ class PlaceRecognitionNode(Node):
 
     def _publish(self, answer: PlaceAnswer, scan: _Scan) -> None:
         self.diagnostics.tick('answers', scan.pose.stamp_ns)
+        self._answer_watch.take(answer)
         self._matches_out.publish(matches_message(answer, scan.points.header))
         self.diagnostics.warn('guarantee', answer.withdrawn and f'no guarantee: {answer.withdrawn}')
         best = answer.best

@@ -1,0 +1,28 @@
+"""Open the recognizer that a node's parameters describe."""
+
+from rclpy.node import Node
+
+from lcd_common.nodes.parameters import declare_config
+from lcd_loop_closure.reduction import ReductionConfig
+from uncertain_place_recognition.opened import open_recognizer
+from uncertain_place_recognition.place_recognizer import PlaceRecognizer, PlaceRecognizerConfig
+from uncertain_place_recognition.retrieval.engines import IndexConfig, IndexMaker
+from uncertain_place_recognition.retrieval.faiss_index import FaissConfig
+from uncertain_place_recognition.retrieval.qdrant_index import QdrantConfig
+
+
+def declared_recognizer(
+    node: Node, weights: str, calibration: str, reduction: ReductionConfig, device: str
+) -> PlaceRecognizer:
+    """Declare the groups recognizer and index, and return a recognizer without places.
+
+    Raises:
+        LocalizationError: a parameter is wrong, or something cannot be opened (`open_recognizer`).
+    """
+    settings = declare_config(node, PlaceRecognizerConfig, 'recognizer')
+    index = IndexMaker(
+        declare_config(node, IndexConfig, 'index'),
+        declare_config(node, FaissConfig, 'index.faiss'),
+        declare_config(node, QdrantConfig, 'index.qdrant'),
+    )
+    return open_recognizer(weights, calibration, settings, reduction, device, index)
