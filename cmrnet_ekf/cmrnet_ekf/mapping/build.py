@@ -30,7 +30,8 @@ examples:
   build_lidar_map drive.mcap --out map               with the ground truth of the recording
   build_lidar_map drive.mcap --poses trajectory.tum --out map
                                                      with poses of run_drive or of any SLAM
-  build_lidar_map saved_map --out map                keyframes of a map that pose_graph saved
+  build_lidar_map saved_map --sensor-height 1.73 --out map
+                                                     keyframes of a map that pose_graph saved
   build_lidar_map DATASET --sequence 00 --labels DATASET/sequences/00/labels --out map
                                                      SemanticKITTI's labels say what moves
   build_lidar_map town:3 --labels --out map          a simulated town, which knows what moves
@@ -38,8 +39,11 @@ examples:
   build_lidar_map town:3:1 --out map                 the same again goes on with the map
 
 The map is a folder of tiles. It may be larger than memory; a map that is there already grows.
-Without labels, what other sweeps saw through is taken for moving.
+Without labels, what other sweeps saw through is taken for moving. A saved map keeps clouds in
+base_link's frame: how high the LiDAR sat, from where it saw, must be told (or --keep-moving).
 """
+_HIGHEST_M = 20.0
+_OF_DRIVES = ('poses', 'labels', 'start', 'duration', 'format', 'sequence', 'topic')
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,11 @@ def _build(arguments: argparse.Namespace) -> None:
     sweeps: Iterator[Sweep]
     total: int | None
     if (saved / 'graph.npz').is_file():
-        sweeps, total = _keyframes(saved)
+        sweeps, total = _keyframes(saved, arguments)
+    elif arguments.sensor_height is not None:
+        raise ConfigError(
+            f'--sensor-height is of a saved map; {arguments.input} says itself where its LiDAR sits'
+        )
     else:
         sweeps, total = _of_drive(drive_from(arguments), arguments)
     builder = MapBuilder(TileFolder.create(arguments.out, settings), settings)
@@ -142,16 +150,38 @@ def drive_sweeps(
         yield Sweep(cloud, T_map_base, places[scan.frame_id], moving)
 
 
-def _keyframes(path: Path) -> tuple[Iterator[Sweep], int]:
+def _keyframes(path: Path, arguments: argparse.Namespace) -> tuple[Iterator[Sweep], int]:
     from lcd_loop_closure.map_store import load_map
 
+    plain = _parser()
+    strange = [f'--{n}' for n in _OF_DRIVES if getattr(arguments, n) != plain.get_default(n)]
+    if strange:
+        raise ConfigError(
+            f'{path}: is a saved map, which has poses and clouds of its own; leave out '
+            f'{", ".join(strange)}, or map the drive itself'
+        )
+    height_m = arguments.sensor_height
+    if height_m is None:
+        if not arguments.keep_moving:
+            raise ConfigError(
+                f'{path}: a saved map does not say where the LiDAR sat; give --sensor-height M, '
+                'its height over base_link (KITTI: 1.73), or --keep-moving'
+            )
+        height_m = 0.0  # nobody asks what a sweep saw through
+    if not 0.0 <= height_m <= _HIGHEST_M:
+        raise ConfigError(
+            f'--sensor-height must be 0 to {_HIGHEST_M:g} metres over base_link, got {height_m:g}'
+        )
     saved = load_map(path)
+    T_base_sensor = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, height_m])
+    rows = range(0, len(saved.graph), arguments.every)
 
     def sweeps() -> Iterator[Sweep]:
-        for row, T_map_base in enumerate(saved.graph.T_map_base):
-            yield Sweep(saved.keyframe(row).cloud, T_map_base, np.eye(4))
+        for row in rows:
+            cloud = saved.keyframe(row).cloud.transformed(se3.inverse(T_base_sensor))
+            yield Sweep(cloud, saved.graph.T_map_base[row], T_base_sensor)
 
-    return sweeps(), len(saved.graph)
+    return sweeps(), len(rows)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -169,6 +199,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--every', type=int, default=1, metavar='N', help='take each N-th sweep (default: 1)')
     add('--labels', nargs='?', const='', metavar='FOLDER',
         help="SemanticKITTI's .label files; without a folder, the input's own labels")  # fmt: skip
+    add('--sensor-height', type=float, metavar='M',
+        help='of the LiDAR over base_link; for a saved map, which does not say it')  # fmt: skip
     add('--keep-moving', action='store_true', help='do not remove what sweeps saw through')
     add('--voxel', type=float, default=defaults.voxel, metavar='M', help='(default: %(default)s)')
     add('--max-range', type=float, default=defaults.max_range, metavar='M',
