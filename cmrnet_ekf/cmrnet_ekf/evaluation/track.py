@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from bags.input_arguments import add_input, add_span, drive_from
@@ -21,6 +22,7 @@ from cmrnet_ekf.evaluation.tracking_study import draw, figures_of, markdown, tra
 from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig
 from cmrnet_ekf.mapping.settings import MapConfig
 from cmrnet_ekf.networks.config import CmrnetConfig
+from cmrnet_ekf.predictors import Predictor
 from lcd_common.command_line import run
 from lcd_common.device import choose_device
 from lcd_common.errors import ConfigError, DataError
@@ -32,6 +34,8 @@ examples:
   track_cmrnet drive.mcap --map map --networks mcd=runs/mcd der=runs/der --out tracked
   track_cmrnet towns:200 --length 1200 --map maps/town_200 --networks cmrnet=runs/plain0 \\
       de=runs/plain0,runs/plain1,runs/plain2 der=runs/der --runs 20 --out tracked
+  track_cmrnet drive.mcap --map map --networks der=runs/der fine=runs/der \\
+      --second fine=runs/fine_der --out tracked          one stage beside two, each from the last
   track_cmrnet KITTI --sequence 00 --map maps/00 --networks der=runs/der --out tracked \\
       --set start_translation=1 speed_scale=0.02
 
@@ -39,8 +43,9 @@ towns:N is a simulated town, mapped (into --map, if that is not there yet) on on
 another. Each run starts at a wrong pose and has no satellites. The motion model gets the
 gyroscope's turns and wheels that err (--set); the camera is asked from what the filter predicts.
 Rows: the motion model alone; corrected by a plain network without a filter; the thesis's EKF with
-each network that says how sure it is. Written are results.json, results.md, heat.png and
-tracks.npz; the images, as the networks take them, are kept in --frames and used again.
+each network that says how sure it is (of several stages, the last one). Written are results.json,
+results.md, heat.png and tracks.npz; the images, as the networks take them, are kept in --frames and
+used again.
 """
 
 
@@ -53,12 +58,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _track(arguments: argparse.Namespace) -> None:
     out = results_folder(arguments.out)
     device = choose_device(arguments.device)
-    networks = named_predictors(arguments.networks, device)
+    networks = _staged([arguments.networks, arguments.second, arguments.third], device)
     settings = changed(TrackingConfig(), arguments.set)
-    first = next(iter(networks.values())).settings
+    first = next(iter(networks.values()))[0].settings
     drive = _recorded(arguments, first)
     local_map = LocalMap(arguments.map, LocalMapConfig(kept_tiles=2000))
-    chosen = ways({name: [predictor] for name, predictor in networks.items()})
+    chosen = ways(networks)
     runs = dict.fromkeys(chosen, arguments.runs)
     found: dict[str, list[Track]] = defaultdict(list)
     total = sum(runs.values()) * (len(drive) - 1)
@@ -88,6 +93,27 @@ def write_tracks(found: dict[str, list[Track]], path: Path) -> None:
             arrays[f'{name}_{one.seed}_xi'] = one.xi
             arrays[f'{name}_{one.seed}_covariance'] = one.covariances
     np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def _staged(
+    texts: Sequence[Sequence[str]], device: torch.device | str
+) -> dict[str, list[Predictor]]:
+    """Return the stages of each network by name; `texts` are those of each stage."""
+    found = {name: [one] for name, one in named_predictors(texts[0], device).items()}
+    images = tuple(next(iter(found.values()))[0].settings.images)
+    for number, stage in enumerate(texts[1:], start=2):
+        for name, predictor in named_predictors(stage, device).items():
+            if len(found.get(name, ())) != number - 1:
+                raise ConfigError(f'stage {number} has {name}, the stage before has not')
+            found[name].append(predictor)
+    for name, stages in found.items():
+        for number, predictor in enumerate(stages, start=1):
+            if tuple(predictor.settings.images) != images:
+                raise ConfigError(
+                    f'{name}, stage {number}, takes images {tuple(predictor.settings.images)}, '
+                    f'the first network {images}: all must take the same'
+                )
+    return found
 
 
 def _recorded(arguments: argparse.Namespace, network: CmrnetConfig) -> TrackingDrive:
@@ -130,6 +156,9 @@ def _parser() -> argparse.ArgumentParser:
     add('--map', type=Path, required=True, help='LiDAR map of where it goes (build_lidar_map)')
     add('--networks', nargs='+', required=True, metavar='NAME=PATH[,PATH]',
         help='weights, or folders of train_cmrnet; several are an ensemble')  # fmt: skip
+    add('--second', nargs='+', default=[], metavar='NAME=PATH[,PATH]',
+        help='networks of the second stage, by the same names')  # fmt: skip
+    add('--third', nargs='+', default=[], metavar='NAME=PATH[,PATH]', help='of the third')
     add('--out', type=Path, required=True, help='folder for the results')
     add('--frames', type=Path, help='folder that keeps the images (default: OUT_frames)')
     add('--poses', type=Path, metavar='TUM', help='poses of base_link (default: ground truth)')

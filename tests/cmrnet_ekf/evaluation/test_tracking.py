@@ -241,3 +241,56 @@ def test_the_command_tracks_with_networks(tmp_path, monkeypatch, capsys):
 
 def truth_positions():
     return StreetWithCamera().truth().positions[1:]
+
+
+@pytest.fixture
+def command_line(tmp_path, monkeypatch):
+    """Return a command without networks, and write those that it may name."""
+    street_map(tmp_path / 'map')
+    monkeypatch.setattr(command, 'drive_from', lambda arguments: StreetWithCamera())
+    monkeypatch.setattr(command, 'span_ns', lambda *a: (0, None))
+    der = replace(SMALL, head='evidential')
+    for name, config in {
+        'plain': SMALL, 'one': der, 'two': der, 'three': der, 'zoomed': replace(der, focal=50.0),
+    }.items():  # fmt: skip
+        save_network(tmp_path / f'{name}.safetensors', Cmrnet(config), {})
+    monkeypatch.chdir(tmp_path)
+    return ['made_up', '--map', 'map', '--out', 'out', '--runs', '1', '--quiet']
+
+
+def test_the_command_refines_in_stages(command_line, monkeypatch):
+    seen = {}
+
+    def remembered(drive, local_map, chosen, *rest):
+        seen.update(chosen)
+        return study_tracks(drive, local_map, chosen, *rest)
+
+    study_tracks = command.tracks
+    monkeypatch.setattr(command, 'tracks', remembered)
+    line = [
+        *command_line, '--networks', 'der=one.safetensors', 'deep=one.safetensors',
+        'rough_first=plain.safetensors', '--second', 'deep=two.safetensors',
+        'rough_first=two.safetensors', '--third', 'deep=three.safetensors',
+    ]  # fmt: skip
+    assert command.main(line) == 0
+    counts = {name: len(way.stages) for name, way in seen.items()}
+    assert counts == {'motion': 0, 'der': 1, 'deep': 3, 'rough_first': 2}
+    assert seen['rough_first'].filtered, 'the last network says how sure it is'
+    assert [p.kind for p in seen['rough_first'].stages] == ['plain', 'der']
+    with open('out/results.json') as file:
+        assert list(json.load(file)['ways']) == list(counts)
+
+
+@pytest.mark.parametrize(
+    ('stages', 'message'),
+    [
+        (['--second', 'mcd=two.safetensors'], 'stage 2 has mcd, the stage before has not'),
+        (['--third', 'der=two.safetensors'], 'stage 3 has der, the stage before has not'),
+        (['--second', 'der=zoomed.safetensors'], 'der, stage 2, takes images'),
+        (['--second', 'der'], 'expected NAME=FILE'),
+    ],
+)
+def test_stages_that_do_not_fit_are_refused(command_line, capsys, stages, message):
+    assert command.main([*command_line, '--networks', 'der=one.safetensors', *stages]) == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count('\n') == 1, error
