@@ -23,7 +23,7 @@ from lcd_loop_closure.evaluation.sweep_views import without_sector
 from uncertain_place_recognition.evaluation.failure import auroc
 from uncertain_place_recognition.evaluation.figures import figure
 from uncertain_place_recognition.opened import open_recognizer
-from uncertain_place_recognition.place_recognizer import PlaceRecognizer
+from uncertain_place_recognition.place_recognizer import PlaceRecognizer, PlaceRecognizerConfig
 from uncertain_place_recognition.uncertainty import total_uncertainty
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _MOUNT = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 1.73])
 _SAME_PLACE_M = 25.0
+_EVERY_SCAN = {'asked__distance': 0.1, 'places__distance': 0.1, 'recognizer__delay': 0}
 
 
 def evaluate(work: Path, step: int = 3) -> dict[str, Any]:
@@ -187,7 +188,7 @@ def _kitti_00(work: Path) -> dict[str, Any]:
     truth = drive.truth()
     assert truth is not None
     poses = dict(zip(truth.stamps_ns.tolist(), truth.T_world_body, strict=True))
-    answers = _through_the_node(drive, poses, places__distance=0.1, recognizer__delay=0)
+    answers = _through_the_node(drive, poses, **_EVERY_SCAN)
     here, there = (_positions(truth, one) for one in (answers.stamps_ns, answers.found_ns))
     right = np.linalg.norm(here - there, axis=1) <= _SAME_PLACE_M
     known = np.array(
@@ -215,7 +216,7 @@ def _kitti_00(work: Path) -> dict[str, Any]:
 def _kitti_360(work: Path) -> dict[str, Any]:
     """Drive KITTI-360's frames, which are one place, through odometry and the node."""
     drive = open_drive(folder() / 'data' / 'kitti_360')
-    answers = _through_the_node(drive, places__distance=0.5, recognizer__delay=0)
+    answers = _through_the_node(drive, **_EVERY_SCAN)
     right = np.ones(len(answers.stamps_ns), bool)  # one place: whatever is found is right
     title = 'KITTI-360: frames within 23.5 m are one place'
     _draw_answers(answers, right, right, title, work / 'pictures' / 'kitti_360.png')
@@ -245,7 +246,8 @@ def _position(truth: Trajectory, stamp_ns: int) -> NDArray[np.float64]:
 
 
 def _was_here(truth: Trajectory, places: list[int], stamp: int, where: NDArray[np.float64]) -> bool:
-    before = [one for one in places if one < stamp][:-15]
+    # The newest places wait.
+    before = [one for one in places if one < stamp][: -PlaceRecognizerConfig().delay]
     at = np.array([_position(truth, one) for one in before]).reshape(-1, 2)
     return bool((np.linalg.norm(at - where, axis=1) <= _SAME_PLACE_M).any())
 

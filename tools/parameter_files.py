@@ -39,9 +39,13 @@ from lcd_loop_closure.place_gate import PlaceGateConfig
 from lcd_loop_closure.reduction import ReductionConfig
 from lcd_loop_closure.robust_solver import RobustSolverConfig
 from lcd_loop_closure.session_anchor import AnchorConfig
+from uncertain_place_recognition.drive_places import AskedConfig, PlaceSpacingConfig
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNodeConfig
 from uncertain_place_recognition.place_recognizer import PlaceRecognizerConfig
 from uncertain_place_recognition.relocalizer import RelocalizerConfig
+from uncertain_place_recognition.retrieval.engines import IndexConfig
+from uncertain_place_recognition.retrieval.faiss_index import FaissConfig
+from uncertain_place_recognition.retrieval.qdrant_index import QdrantConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 _COMMENT_AT = 44
@@ -102,8 +106,12 @@ def _nodes() -> dict[str, dict[str, _Parts]]:
             'place_recognition': (
                 (PlaceRecognitionNodeConfig,),
                 {
-                    'places': KeyframeConfig,
+                    'asked': AskedConfig,
+                    'places': PlaceSpacingConfig,
                     'recognizer': PlaceRecognizerConfig,
+                    'index': IndexConfig,
+                    'index.faiss': FaissConfig,
+                    'index.qdrant': QdrantConfig,
                     'reduction': ReductionConfig,
                     'relocalizer': RelocalizerConfig,
                 },

@@ -35,7 +35,7 @@ def test_answers_name_the_scan_that_was_there_before(tmp_path):
     stamps = [record.stamp_ns for record in drive.records()]
     first = [T for _, T in zip(range(TWICE), truth.T_world_body, strict=False)]
     poses = dict(zip(stamps, [*first, *first], strict=True))
-    found = answers_of(drive, poses, places__distance=0.1, recognizer__delay=0)
+    found = answers_of(drive, poses, asked__distance=0.1, places__distance=0.1, recognizer__delay=0)
     assert len(found.places_ns) >= 2
     again = np.isin(found.stamps_ns, stamps[TWICE:])
     assert again.any()

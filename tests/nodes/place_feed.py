@@ -13,7 +13,7 @@ from lcd_msgs.msg import PlaceMatchArray
 from lcd_msgs.srv import LoadMap, SaveMap
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 
-SPACING = {'places__distance': 0.5, 'recognizer__delay': 0}
+SPACING = {'asked__distance': 0.5, 'places__distance': 0.5, 'recognizer__delay': 0}
 
 
 class Fed:

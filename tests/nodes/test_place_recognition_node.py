@@ -74,7 +74,7 @@ def test_every_chosen_scan_is_answered_with_what_came_before(fed: Callable[..., 
 
 
 def test_places_keep_their_distance_and_wait(fed: Callable[..., Fed]) -> None:
-    made = fed(places__distance=2.5, recognizer__delay=2)
+    made = fed(asked__distance=2.5, places__distance=2.5, recognizer__delay=2)
     for step in range(13):
         made.step(step)
     assert len(made.answers) == 5  # steps 0 3 6 9 12
@@ -172,7 +172,7 @@ def test_maps_are_saved_and_loaded_by_services(fed: Callable[..., Fed], tmp_path
     later.step(20, seen=3)
     assert later.answers[0].matches[0].place_id == 3
     later.step(21)
-    assert later.counted('places not added: not located') == 2
+    assert later.counted('scans that are no places') == 2
     assert len(later.node.recognizer) == 4
     assert later.load(tmp_path / 'map').message.startswith('4 places loaded')
     with pytest.raises(MapError, match='expected the folder of saved places'):
@@ -180,7 +180,7 @@ def test_maps_are_saved_and_loaded_by_services(fed: Callable[..., Fed], tmp_path
 
 
 def test_a_place_is_added_by_hand(fed: Callable[..., Fed]) -> None:
-    made = fed(grow=False, places__distance=50.0)
+    made = fed(grow=False, asked__distance=50.0)
     made.step(0)
     made.step(1)
     assert len(made.node.recognizer) == 0

@@ -19,8 +19,20 @@ from uncertain_place_recognition.relocalizer import Relocalized, Relocalizer, Re
 
 
 @config
+class AskedConfig:
+    """Which scans are asked about when odometry chooses them (follow: odom)."""
+
+    distance: float = setting(3.0, 'travelled distance between scans', unit='m', low=0.1)
+    angle: float = setting(0.5, 'turned angle between scans', unit='rad', low=0.01, high=3.15)
+
+    def selector(self) -> KeyframeSelector:
+        """Return what chooses scans by it."""
+        return KeyframeSelector(KeyframeConfig(self.distance, self.angle))
+
+
+@config
 class PlaceSpacingConfig:
-    """How far apart places are: as the submaps of the calibration, or its promises do not fit.
+    """How far apart places lie: as the submaps of the calibration, or its promises do not fit.
 
     What speaks against a match is told from the ten best, and in a denser map all ten are of one
     place.
@@ -53,7 +65,7 @@ class DrivePlaces:
     ) -> None:
         """Begin a drive in the recognizer's map; with `relocalizer` look for the vehicle in it.
 
-        With `spacing` scans nearer to the last place are not remembered, whoever chose them.
+        With `spacing` scans nearer to the last place are asked about, but not remembered.
         """
         self._recognizer, self._reduction = recognizer, reduction
         self._by_keyframes = by_keyframes

@@ -35,7 +35,7 @@ class PlaceRecognizerConfig:
     """How a scan is answered, and how the map grows."""
 
     matches: int = setting(5, 'places of one answer', low=1)
-    delay: int = setting(15, 'places that must follow a new one before it can be an answer', low=0)
+    delay: int = setting(5, 'places that must follow a new one before it can be an answer', low=0)
     position_sigma: float = setting(
         5.0, 'how far a scan may be from the place it matches', unit='m', low=0.01
     )

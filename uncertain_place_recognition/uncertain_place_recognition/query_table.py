@@ -147,7 +147,7 @@ def _elsewhere(runs: Sequence[EmbeddedRun], world: str) -> list[EmbeddedRun]:
 
 
 def one_map(runs: Sequence[EmbeddedRun]) -> EmbeddedRun:
-    """Return runs as one database of the first one's world, with the ensembles that all of them have."""
+    """Return runs as one database of the first one's world, with the ensembles that all have."""
     groups = set.intersection(*(set(run.members) for run in runs))
     return EmbeddedRun(
         ' + '.join(run.name for run in runs),

@@ -44,7 +44,6 @@ from lcd_common.nodes.worker import Worker
 from lcd_common.priority import lower_priority
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
-from lcd_loop_closure.keyframes import KeyframeConfig, KeyframeSelector
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
@@ -52,7 +51,7 @@ from lcd_loop_closure.radius_search import GraphPositions
 from lcd_loop_closure.reduction import ReductionConfig
 from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import PlaceMatchArray
-from uncertain_place_recognition.drive_places import DrivePlaces
+from uncertain_place_recognition.drive_places import AskedConfig, DrivePlaces, PlaceSpacingConfig
 from uncertain_place_recognition.nodes.answer_watch import AnswerWatch
 from uncertain_place_recognition.nodes.declared_recognizer import declared_recognizer
 from uncertain_place_recognition.nodes.place_messages import (
@@ -121,7 +120,8 @@ class PlaceRecognitionNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('place_recognition', **node_options)
         self.config = declare_config(self, PlaceRecognitionNodeConfig)
-        self._selector = KeyframeSelector(declare_config(self, KeyframeConfig, 'places'))
+        self._selector = declare_config(self, AskedConfig, 'asked').selector()
+        self._spacing = declare_config(self, PlaceSpacingConfig, 'places')
         self._reduction = declare_config(self, ReductionConfig, 'reduction')
         self._relocalizer = declare_config(self, RelocalizerConfig, 'relocalizer')
         if self.config.threads:
@@ -248,6 +248,7 @@ class PlaceRecognitionNode(Node):
             self._relocalizer if self.config.relocalize and path else None,
             self._reduction,
             by_keyframes=self._by_keyframes,
+            spacing=self._spacing,
         )
 
     def look_again(self) -> None:
@@ -336,7 +337,7 @@ class PlaceRecognitionNode(Node):
         self.diagnostics.warn('relocalize', waits or None)
         if self.config.grow or drive.force_next:
             added = drive.add(members, cloud, scan.pose, scan.keyframe_id)
-            self.diagnostics.count('places added' if added else 'places not added: not located')
+            self.diagnostics.count('places added' if added else 'scans that are no places')
 
     def _cloud(self, scan: _Scan) -> PointCloud | None:
         try:
