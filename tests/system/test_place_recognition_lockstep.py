@@ -88,6 +88,7 @@ def _suite(
                 map=places,
                 relocalize=bool(places),
                 recognizer__delay=3,
+                places__distance=0.1,
                 **options,
                 **inside,
             )
