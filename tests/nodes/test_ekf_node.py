@@ -134,6 +134,23 @@ def test_services_and_initialpose(bench: Callable[..., Bench]) -> None:
     assert running.off(151) < 1e-6
 
 
+def test_a_click_says_nothing_of_height_and_tilt(bench: Callable[..., Bench]) -> None:
+    running = bench(
+        start_from='set_pose', publish_rate=0.0, start__position=0.7, start__rotation=0.05
+    )
+    running.drive(0, 50)
+    click = camera(49)
+    covariance = np.zeros((6, 6))
+    covariance[0, 0] = covariance[1, 1] = 0.25
+    covariance[5, 5] = 0.0685
+    click.pose.covariance = covariance.ravel()
+    running.feed('initialpose', click)
+    assert len(running.odometry) == 1
+    found = np.reshape(running.odometry[-1].pose.covariance, (6, 6))
+    expected = [0.25, 0.25, 0.49, 0.0025, 0.0025, 0.0685]
+    np.testing.assert_allclose(np.diag(found), expected, rtol=0.02)
+
+
 def test_it_owns_map_to_odom_and_uses_odometrys_motion(bench: Callable[..., Bench]) -> None:
     running = bench(
         odometry='odom', tf='map_to_odom', odom__sigma_position=0.02, odom__sigma_rotation=0.002

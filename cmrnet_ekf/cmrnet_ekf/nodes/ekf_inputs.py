@@ -132,6 +132,18 @@ def pose_covariance(
     return se3.covariance_from_ros(T, used_covariance(covariance, np.array(axes), what))
 
 
+def stated_covariance(ros_covariance: object, position: float, rotation: float) -> se3.Array:
+    """Return 36 numbers [6 x 6] with the variances of axes of which nothing is said, m and rad.
+
+    RViz's click says nothing of z, roll and pitch: zeros in their rows and columns.
+    """
+    covariance = np.array(ros_covariance, np.float64).reshape(6, 6)
+    unsaid = ~(covariance.any(axis=0) | covariance.any(axis=1))
+    variances = np.square([position] * 3 + [rotation] * 3)
+    covariance[unsaid, unsaid] = variances[unsaid]
+    return covariance
+
+
 def twist_vector(message: Twist) -> NDArray[np.float64]:
     """Return linear and angular velocity [6]."""
     v, w = message.linear, message.angular

@@ -35,7 +35,7 @@ from cmrnet_ekf.ekf.gnss_start import GnssStartConfig, StartPose
 from cmrnet_ekf.ekf.observations import Observation
 from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
 from cmrnet_ekf.nodes.ekf_health import EkfHealth, EkfHealthConfig
-from cmrnet_ekf.nodes.ekf_inputs import imu_sample, pose_covariance
+from cmrnet_ekf.nodes.ekf_inputs import imu_sample, pose_covariance, stated_covariance
 from cmrnet_ekf.nodes.ekf_outputs import EkfOutputs
 from cmrnet_ekf.nodes.ekf_sources import EkfSources
 from lcd_common import se3
@@ -213,9 +213,9 @@ class EkfNode(Node):
         T_map_base = messages.transform_from_pose(message.pose.pose)
         covariance = None
         if np.any(message.pose.covariance):
-            covariance = pose_covariance(
-                T_map_base, message.pose.covariance, (0.0, 0.0), _ALL, 'start pose'
-            )
+            start = self.ekf.settings.start
+            stated = stated_covariance(message.pose.covariance, start.position, start.rotation)
+            covariance = pose_covariance(T_map_base, stated, (0.0, 0.0), _ALL, 'start pose')
         stamp_ns = messages.stamp_ns(message.header.stamp)
         newest_ns = self.ekf.newest_ns or self._guard.newest_ns
         # What a person clicks carries the time of the screen: it means now.
