@@ -20,6 +20,7 @@ from lcd_common import se3
 from lcd_common.errors import ConfigError, MapError
 from lcd_common.nodes import messages
 from lcd_msgs.msg import PlaceMatchArray
+from uncertain_place_recognition.nodes.declared_recognizer import warn_of_spacing
 from uncertain_place_recognition.nodes.place_recognition_node import PlaceRecognitionNode
 from uncertain_place_recognition.place import Judgement
 from uncertain_place_recognition.relocalizer import Relocalized
@@ -36,7 +37,7 @@ def fed(make: Callable[..., Any], small_weights: Path) -> Callable[..., Fed]:
 class Vouching:
     """Judge that accepts what looks exactly the same."""
 
-    metric, matches = 'cosine', 5
+    metric, matches, spacing_m = 'cosine', 5, None
     withdrawn: str | None = None
 
     def reset(self) -> None:
@@ -300,3 +301,20 @@ def test_help_names_topics_and_services() -> None:
     )
     for word in ('Subscribes', 'Publishes', 'Services', 'place_matches', '~/load_map', 'ros2 run'):
         assert word in run.stdout
+
+
+def test_places_much_closer_than_the_calibration_s_are_warned_of(
+    fed: Callable[..., Fed], capfd: pytest.CaptureFixture[str]
+) -> None:
+    node = fed(asked__distance=1.0, places__distance=1.0).node
+    assert node.recognizer.calibrated_spacing_m is None
+    judge = Vouching()
+    judge.spacing_m = 10.2  # type: ignore[assignment]
+    node.recognizer._judge = judge
+    capfd.readouterr()
+    warn_of_spacing(node, node.recognizer, 9.0)
+    assert 'places.distance' not in capfd.readouterr().err
+    warn_of_spacing(node, node.recognizer, 3.0)
+    assert (
+        'places.distance is 3 m, the calibration had a place every 10.2 m' in capfd.readouterr().err
+    )

@@ -38,7 +38,7 @@ def _block() -> StreetDrive:
 class Doubting:
     """Judge that believes nothing at all, or all."""
 
-    metric, matches = 'cosine', 5
+    metric, matches, spacing_m = 'cosine', 5, None
 
     def __init__(self, believes: bool) -> None:
         self._believes = believes

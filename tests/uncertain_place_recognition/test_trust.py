@@ -21,9 +21,11 @@ def neighbours(similarity, distance):
 
 
 def test_a_saved_calibration_judges_the_same(tmp_path):
-    made = calibration()
+    made = calibration(ambiguity=AmbiguityConfig(matches=3, same_place=0.5), spacing_m=9.5)
     made.save(tmp_path / 'calibration.json')
     loaded = Calibration.load(tmp_path / 'calibration.json', made.ensemble)
+    assert loaded.ambiguity == made.ambiguity and loaded.spacing_m == 9.5
+    assert Trust(loaded).matches == 3 and Trust(loaded).spacing_m == 9.5
     where = np.array([[0.0, 0, 0], [1, 0, 0], [90, 0, 0]])
     for best in (0.99, 0.8, 0.3):
         found = neighbours([best, 0.3, 0.2], [1 - best, 0.9, 1.0])

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from uncertain_place_recognition.calibration import Calibrated
     from uncertain_place_recognition.query_table import QueryTable
 
-_log = logging.getLogger(__name__)
 _EXAMPLES = """
 examples:
   calibrate_place_recognition runs/calibration --ensemble weights/ensemble.safetensors \\
@@ -57,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from uncertain_place_recognition.calibration import TARGETS, calibrate
     from uncertain_place_recognition.evaluation.guarantee import observe
     from uncertain_place_recognition.evaluation.pairs import PairConfig
-    from uncertain_place_recognition.query_table import query_table
+    from uncertain_place_recognition.query_table import query_table, spacing_m
     from uncertain_place_recognition.run_inputs import load_embedded, load_ensembles, weights_of
     from uncertain_place_recognition.trust import Calibration
 
@@ -80,7 +78,9 @@ def _run(arguments: argparse.Namespace) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for target in targets:
         acceptance = found.acceptance(arguments.kind, target)
-        file = Calibration(weights, table.metric, found.model, acceptance, found.drift)
+        file = Calibration(
+            weights, table.metric, found.model, acceptance, found.drift, ambiguity, spacing_m(runs)
+        )
         name = 'calibration' if target == arguments.target else f'calibration_{_percent(target)}'
         file.save(out / f'{name}.json')
     figures = _figures(found, table)
@@ -89,12 +89,6 @@ def _run(arguments: argparse.Namespace) -> None:
     (out / RESULTS).write_text(json.dumps(figures, indent=2) + '\n')
     _draw(found, table, out)
     sys.stdout.write(_text(figures) + f'\nwritten to {out}\n')
-    if ambiguity != AmbiguityConfig():
-        # The file does not hold these settings, and other ones give other probabilities.
-        _log.warning(
-            'calibrated with other settings of ambiguity than the node has: give Trust the same '
-            'AmbiguityConfig, and do not copy this calibration.json beside weights for the node'
-        )
 
 
 def _percent(target: float) -> str:

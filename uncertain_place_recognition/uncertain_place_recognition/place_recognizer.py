@@ -78,6 +78,10 @@ class Judge(Protocol):
     def matches(self) -> int:
         """Neighbours that a judgement needs."""
 
+    @property
+    def spacing_m(self) -> float | None:
+        """How far apart places were when it learnt to judge; None when nobody knows."""
+
     def reset(self) -> None:
         """Forget the scans so far: another drive begins."""
 
@@ -143,6 +147,11 @@ class PlaceRecognizer:
     def searchable(self) -> int:
         """Places that can be answered: those that are not too new."""
         return self._index.searchable
+
+    @property
+    def calibrated_spacing_m(self) -> float | None:
+        """How far apart places must be for what is said of matches; None when nobody knows."""
+        return None if self._judge is None else self._judge.spacing_m
 
     @property
     def next_id(self) -> int:

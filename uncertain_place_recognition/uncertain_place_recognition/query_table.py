@@ -136,6 +136,13 @@ def feature_rows(
     )
 
 
+def spacing_m(runs: Sequence[EmbeddedRun]) -> float | None:
+    """Return how far apart submaps of a run are, the median; None of runs with one submap."""
+    apart = [np.linalg.norm(np.diff(run.positions, axis=0), axis=1) for run in runs]
+    every = np.concatenate([*apart, np.empty(0)])
+    return float(np.median(every)) if len(every) else None
+
+
 def _elsewhere(runs: Sequence[EmbeddedRun], world: str) -> list[EmbeddedRun]:
     """Return the runs of all other worlds, each world far from the others."""
     worlds = sorted({run.world for run in runs} - {world})

@@ -1,14 +1,15 @@
 """Say how far a match can be believed: probability, calibrated threshold, and whether both hold."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lcd_common import se3
-from lcd_common.errors import MapError
+from lcd_common.errors import ConfigError, MapError
+from lcd_common.settings import from_mapping
 from uncertain_place_recognition.acceptance import GROWTH, Acceptance
 from uncertain_place_recognition.ambiguity import AmbiguityConfig, match_spread, second_place_ratio
 from uncertain_place_recognition.drift_alarm import DriftAlarm, DriftConfig, DriftReference
@@ -29,6 +30,8 @@ class Calibration:
         model: gives probabilities.
         acceptance: gives the threshold, and what it promises.
         drift: uncertainties that the calibration saw; None where nobody watches for drift.
+        ambiguity: by which matches were compared.
+        spacing_m: between the places of the calibration's maps; None in files of before.
     """
 
     ensemble: str
@@ -36,6 +39,8 @@ class Calibration:
     model: MatchModel
     acceptance: Acceptance
     drift: DriftReference | None = None
+    ambiguity: AmbiguityConfig = field(default_factory=AmbiguityConfig)
+    spacing_m: float | None = None
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
@@ -46,6 +51,8 @@ class Calibration:
             'metric': self.metric,
             'acceptance': self.acceptance.plain(),
             'drift': None if self.drift is None else self.drift.plain(),
+            'ambiguity': asdict(self.ambiguity),
+            'spacing_m': self.spacing_m,
             'model': self.model.plain(),
         }
         path.write_text(json.dumps(plain, indent=2) + '\n')
@@ -75,17 +82,19 @@ class Calibration:
                 f'{ensemble[:12]}): calibrate this ensemble, or name its own file'
             )
         try:
-            drift = plain['drift']
+            drift, spacing = plain['drift'], plain.get('spacing_m')
             return Calibration(
                 str(plain['ensemble']),
                 str(plain['metric']),
                 MatchModel.from_plain(plain['model']),
                 Acceptance.from_plain(plain['acceptance']),
                 None if drift is None else DriftReference.from_plain(drift),
+                from_mapping(AmbiguityConfig, plain.get('ambiguity', {})),
+                None if spacing is None else float(spacing),
             )
         except KeyError as error:
             raise MapError(f'{path}: {error.args[0]} is missing; calibrate anew') from None
-        except MapError as error:
+        except (MapError, ConfigError) as error:
             raise MapError(f'{path}: {error}; calibrate anew') from None
 
 
@@ -96,14 +105,9 @@ class Trust:
     that look alike) and while the inputs are not like its inputs (`DriftAlarm`).
     """
 
-    def __init__(
-        self,
-        calibration: Calibration,
-        ambiguity: AmbiguityConfig | None = None,
-        drift: DriftConfig | None = None,
-    ) -> None:
+    def __init__(self, calibration: Calibration, drift: DriftConfig | None = None) -> None:
         self.calibration = calibration
-        self._ambiguity = ambiguity or AmbiguityConfig()
+        self._ambiguity = calibration.ambiguity
         reference = calibration.drift
         self._alarm = None if reference is None else DriftAlarm(reference, drift)
 
@@ -116,6 +120,11 @@ class Trust:
     def matches(self) -> int:
         """Neighbours that a judgement needs."""
         return self._ambiguity.matches
+
+    @property
+    def spacing_m(self) -> float | None:
+        """How far apart places were when this was calibrated; None when nobody knows."""
+        return self.calibration.spacing_m
 
     def reset(self) -> None:
         """Forget the inputs so far: another drive begins."""

@@ -10,6 +10,8 @@ from uncertain_place_recognition.retrieval.engines import IndexConfig, IndexMake
 from uncertain_place_recognition.retrieval.faiss_index import FaissConfig
 from uncertain_place_recognition.retrieval.qdrant_index import QdrantConfig
 
+_NEAR = (0.6, 1.7)  # times the calibration's spacing
+
 
 def declared_recognizer(
     node: Node, weights: str, calibration: str, reduction: ReductionConfig, device: str
@@ -26,3 +28,13 @@ def declared_recognizer(
         declare_config(node, QdrantConfig, 'index.qdrant'),
     )
     return open_recognizer(weights, calibration, settings, reduction, device, index)
+
+
+def warn_of_spacing(node: Node, recognizer: PlaceRecognizer, distance_m: float) -> None:
+    """Say so when places lie closer or farther apart than those of the calibration."""
+    calibrated = recognizer.calibrated_spacing_m
+    if calibrated is not None and not _NEAR[0] <= distance_m / calibrated <= _NEAR[1]:
+        node.get_logger().warning(
+            f'places.distance is {distance_m:g} m, the calibration had a place every '
+            f'{calibrated:.1f} m: its probabilities and promises are of such maps'
+        )

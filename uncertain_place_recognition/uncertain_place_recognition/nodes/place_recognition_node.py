@@ -53,7 +53,10 @@ from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import PlaceMatchArray
 from uncertain_place_recognition.drive_places import AskedConfig, DrivePlaces, PlaceSpacingConfig
 from uncertain_place_recognition.nodes.answer_watch import AnswerWatch
-from uncertain_place_recognition.nodes.declared_recognizer import declared_recognizer
+from uncertain_place_recognition.nodes.declared_recognizer import (
+    declared_recognizer,
+    warn_of_spacing,
+)
 from uncertain_place_recognition.nodes.place_messages import (
     answer_markers,
     initial_pose_message,
@@ -130,6 +133,7 @@ class PlaceRecognitionNode(Node):
         self.recognizer = declared_recognizer(
             self, weights, calibration, self._reduction, self.config.device
         )
+        warn_of_spacing(self, self.recognizer, self._spacing.distance)
         self.get_logger().info(f'the networks run on {choose_device(self.config.device)}')
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
