@@ -2,6 +2,7 @@
 
 from rclpy.node import Node
 
+from lcd_common.device import choose_device
 from lcd_common.nodes.parameters import declare_config
 from lcd_loop_closure.reduction import ReductionConfig
 from uncertain_place_recognition.opened import open_recognizer
@@ -14,9 +15,17 @@ _NEAR = (0.6, 1.7)  # times the calibration's spacing
 
 
 def declared_recognizer(
-    node: Node, weights: str, calibration: str, reduction: ReductionConfig, device: str
+    node: Node,
+    weights: str,
+    calibration: str,
+    reduction: ReductionConfig,
+    device: str,
+    distance_m: float,
 ) -> PlaceRecognizer:
     """Declare the groups recognizer and index, and return a recognizer without places.
+
+    It says where the networks run, and warns when `distance_m` between places is not about the
+    calibration's.
 
     Raises:
         LocalizationError: a parameter is wrong, or something cannot be opened (`open_recognizer`).
@@ -27,7 +36,10 @@ def declared_recognizer(
         declare_config(node, FaissConfig, 'index.faiss'),
         declare_config(node, QdrantConfig, 'index.qdrant'),
     )
-    return open_recognizer(weights, calibration, settings, reduction, device, index)
+    recognizer = open_recognizer(weights, calibration, settings, reduction, device, index)
+    node.get_logger().info(f'the networks run on {choose_device(device)}')
+    warn_of_spacing(node, recognizer, distance_m)
+    return recognizer
 
 
 def warn_of_spacing(node: Node, recognizer: PlaceRecognizer, distance_m: float) -> None:

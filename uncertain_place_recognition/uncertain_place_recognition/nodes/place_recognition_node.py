@@ -33,7 +33,6 @@ from visualization_msgs.msg import MarkerArray
 
 from lcd_common import se3
 from lcd_common.cloud import PointCloud
-from lcd_common.device import choose_device
 from lcd_common.errors import DataError
 from lcd_common.nodes import messages, qos
 from lcd_common.nodes.diagnostics import Diagnostics
@@ -53,10 +52,7 @@ from lcd_msgs.msg import Keyframe as KeyframeMessage
 from lcd_msgs.msg import PlaceMatchArray
 from uncertain_place_recognition.drive_places import AskedConfig, DrivePlaces, PlaceSpacingConfig
 from uncertain_place_recognition.nodes.answer_watch import AnswerWatch
-from uncertain_place_recognition.nodes.declared_recognizer import (
-    declared_recognizer,
-    warn_of_spacing,
-)
+from uncertain_place_recognition.nodes.declared_recognizer import declared_recognizer
 from uncertain_place_recognition.nodes.place_messages import (
     answer_markers,
     initial_pose_message,
@@ -129,12 +125,10 @@ class PlaceRecognitionNode(Node):
         self._relocalizer = declare_config(self, RelocalizerConfig, 'relocalizer')
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
-        weights, calibration = self.config.weights, self.config.calibration
+        c = self.config
         self.recognizer = declared_recognizer(
-            self, weights, calibration, self._reduction, self.config.device
+            self, c.weights, c.calibration, self._reduction, c.device, self._spacing.distance
         )
-        warn_of_spacing(self, self.recognizer, self._spacing.distance)
-        self.get_logger().info(f'the networks run on {choose_device(self.config.device)}')
         self.diagnostics = Diagnostics(self)
         self._transforms = StaticTransforms(self)
         self._by_keyframes = self.config.follow == 'keyframes'
