@@ -14,6 +14,7 @@ from uncertain_place_recognition.embedded_run import EmbeddedRun, ordered_pairs
 from uncertain_place_recognition.evaluation.interchange import interchange
 from uncertain_place_recognition.evaluation.pairs import METHODS, PairConfig, judge_pair
 from uncertain_place_recognition.evaluation.study import study
+from uncertain_place_recognition.trust import Calibration
 
 
 def nobody(run):
@@ -102,11 +103,13 @@ def test_ambiguity_is_measured_as_the_settings_say(runs, tmp_path, capsys):
         assert "'metches=3' is no setting" in capsys.readouterr().err
 
 
-def test_a_calibration_that_the_node_cannot_use_says_so(tmp_path, caplog):
+def test_a_calibration_keeps_its_ambiguity_and_spacing_for_the_node(tmp_path):
     for name in 'abc':
         run = made_run(name, submaps=50, noise=0.3)
         replace(run, facts={'weights': {'students': 'h'}}).save(tmp_path / 'in' / f'{name}.npz')
     given = [str(tmp_path / 'in'), '--quiet', '--out', str(tmp_path / 'out')]
-    assert calibrate.main(given) == 0 and not caplog.records
     assert calibrate.main([*given, '--ambiguity', 'matches=5']) == 0
-    assert 'give Trust the same AmbiguityConfig' in caplog.text
+    made = Calibration.load(tmp_path / 'out' / 'calibration.json')
+    assert made.ambiguity.matches == 5
+    step = np.linalg.norm(np.diff(run.positions, axis=0), axis=1)
+    assert made.spacing_m == pytest.approx(float(np.median(step)), rel=0.2)
