@@ -28,6 +28,7 @@ examples:
   make_cmrnet_samples towns:0-9 --out samples        ten simulated towns: samples/town_0_run1 ...
   make_cmrnet_samples towns:100-101 --out judged --length 600
   make_cmrnet_samples towns:0-9 --out samples2 --stage 2        for the second network
+  make_cmrnet_samples towns:0-9 --out samples --turn 2          bends are seen more often
   make_cmrnet_samples KITTI --sequence 03 --map maps/03 --out samples/kitti_03
                                                      a drive with camera and truth, and its map
   make_cmrnet_samples drive.mcap --poses trajectory.tum --map map --out samples/drive
@@ -78,7 +79,7 @@ def _samples(
     out: Path, drive: Any, poses: Any, map_path: Path, arguments: argparse.Namespace, span: Any
 ) -> None:
     network = changed(NETWORKS[arguments.network][0], arguments.set).check()
-    settings = SamplesConfig(arguments.spacing, arguments.draws)
+    settings = SamplesConfig(arguments.spacing, arguments.turn, arguments.draws)
     local_map = LocalMap(map_path, replace(LocalMapConfig(), kept_tiles=2000))
     with tqdm(unit='frame', desc=out.name, disable=arguments.quiet) as bar:
         count = make_samples(
@@ -127,6 +128,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--network', choices=sorted(NETWORKS), default='compact', help='(default: compact)')
     add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the network')
     add('--spacing', type=float, default=defaults.spacing, metavar='M', help='(default: 1)')
+    add('--turn', type=float, default=defaults.turn, metavar='DEG',
+        help='a frame after such a turn, too; 0: by the way alone (default: %(default)g)')  # fmt: skip
     add('--draws', type=int, default=defaults.draws, help='guesses of a frame (default: 8)')
     add('--quiet', action='store_true', help='no progress bars')
     return parser

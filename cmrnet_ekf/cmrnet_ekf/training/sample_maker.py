@@ -26,6 +26,13 @@ class SamplesConfig:
     """Which frames are taken, and how many guesses for each."""
 
     spacing: float = setting(1.0, 'way between frames', unit='m', low=0.0)
+    turn: float = setting(
+        0.0,
+        'turn after which a frame is taken, however short the way: bends are rare, and a vehicle '
+        'that loses itself does so there; 0: way alone',
+        unit='deg',
+        low=0.0,
+    )
     draws: int = setting(8, 'guesses for each frame', low=1)
     least_fill: float = setting(
         0.02, 'share of pixels that must show the map; frames with less are left out', low=0, high=1
@@ -72,7 +79,7 @@ def make_samples(
     framing = framing_of(drive.camera, network)
     imager = imager_of(framing.camera, network)
     rng = np.random.default_rng([settings.seed, zlib.crc32(drive.name.encode())])
-    stamps = _spaced(drive, poses, settings.spacing, span_ns)
+    stamps = _spaced(drive, poses, settings, span_ns)
     out.mkdir(parents=True, exist_ok=True)
     shape = network.height, network.width
     frames = open_memmap(out / 'frames.part.npy', 'w+', np.uint8, (len(stamps), *shape, 3))
@@ -123,19 +130,27 @@ def make_samples(
 
 
 def _spaced(
-    drive: Drive, poses: Trajectory, spacing: float, span_ns: tuple[int | None, int | None]
+    drive: Drive,
+    poses: Trajectory,
+    settings: SamplesConfig,
+    span_ns: tuple[int | None, int | None],
 ) -> NDArray[np.int64]:
-    """Return stamps of frames, spaced by the way of the poses."""
+    """Return stamps of frames, spaced by the way and the turns of the poses."""
     start, end = span_ns
     way = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(poses.positions, axis=0), axis=1))]
     )
-    chosen, last = [], -np.inf
-    for stamp_ns, at in zip(poses.stamps_ns.tolist(), way.tolist(), strict=True):
-        inside = (start is None or stamp_ns >= start) and (end is None or stamp_ns <= end)
-        if inside and at - last >= spacing:
+    chosen, last = [], -1
+    for k, stamp_ns in enumerate(poses.stamps_ns.tolist()):
+        if (start is not None and stamp_ns < start) or (end is not None and stamp_ns > end):
+            continue
+        due = last < 0 or way[k] - way[last] >= settings.spacing
+        if not due and settings.turn:
+            _, radians = se3.distance(poses.T_world_body[last], poses.T_world_body[k])
+            due = np.rad2deg(radians) >= settings.turn
+        if due:
             chosen.append(stamp_ns)
-            last = at
+            last = k
     if not chosen:
         raise DataError(f'{drive.path}: no pose in the part that was asked for')
     return np.array(chosen, np.int64)

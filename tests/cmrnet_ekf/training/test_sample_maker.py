@@ -6,8 +6,10 @@ from cmrnet_ekf.camera_localizer import framing_of, imager_of
 from cmrnet_ekf.mapping.local_map import near_origin
 from cmrnet_ekf.pose_sampling import STAGES, T_OPTICAL_BODY
 from cmrnet_ekf.training.sample_maker import SamplesConfig, make_samples
+from cmrnet_ekf.training.sample_set import SampleSet
 from lcd_common import se3
 from lcd_common.errors import ConfigError, DataError
+from lcd_common.trajectory import Trajectory
 
 
 def test_a_sample_is_the_map_from_the_guess_and_the_image_from_the_truth(tmp_path):
@@ -51,3 +53,16 @@ def test_what_cannot_be_made_is_refused(tmp_path):
     )
     with pytest.raises(DataError, match='agree'):
         make(tmp_path / 'elsewhere', poses=elsewhere)
+
+
+@pytest.mark.parametrize(('turn', 'frames'), [(0.0, 1), (5.0, 5)])
+def test_a_bend_is_seen_more_often_than_its_way(tmp_path, turn, frames):
+    drive, local_map = StreetWithCamera(), street_map(tmp_path / 'map')
+    T = np.tile(np.eye(4), (10, 1, 1))
+    for k in range(10):  # three degrees an image, to both sides of straight ahead
+        T[k] = se3.rotation_z(np.deg2rad(3.0 * k - 13.5))
+        T[k, 0, 3] = 0.1 * k
+    settings = SamplesConfig(spacing=100.0, turn=turn, draws=1)
+    poses = Trajectory(drive.stamps_ns, T)
+    make_samples(tmp_path / 'out', drive, poses, local_map, SMALL, STAGES[0], settings)
+    assert SampleSet(tmp_path / 'out').facts['frames'] == frames
