@@ -128,8 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--network', choices=sorted(NETWORKS), default='compact', help='(default: compact)')
     add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of the network')
     add('--spacing', type=float, default=defaults.spacing, metavar='M', help='(default: 1)')
-    add('--turn', type=float, default=defaults.turn, metavar='DEG',
-        help='a frame after such a turn, too; 0: by the way alone (default: %(default)g)')  # fmt: skip
+    add('--turn', type=float, default=defaults.turn, metavar='DEG', help='frames after turns, too')
     add('--draws', type=int, default=defaults.draws, help='guesses of a frame (default: 8)')
     add('--quiet', action='store_true', help='no progress bars')
     return parser
