@@ -83,6 +83,7 @@ _CLOTHES = np.array(
         (0.1, 0.2, 0.1),
     ]
 )
+_BELOW_ONE = np.nextafter(np.float32(1.0), np.float32(0.0))
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,8 @@ def appearance_of(mesh: Mesh, seed: int, *, one_object: bool = False) -> Appeara
         if each == Kind.PAINT:
             member = np.zeros(len(of), int) if one_object else _joined(middle)[member]
             middle = _middles(corners[of], member)
-        pick[of] = position_hash(middle, seed + int(each))[member]
+        # Below 1, but single precision may round it to 1.
+        pick[of] = np.minimum(position_hash(middle, seed + int(each))[member], _BELOW_ONE)
         palette = np.array(_PALETTES[Kind(each)])
         chosen = palette[(pick[of] * len(palette)).astype(int)]
         shade = 0.85 + 0.3 * position_hash(middle, seed + 100)[member]
