@@ -1,5 +1,7 @@
 """What the tables about CMRNet and the EKF show of benchmarks/results/cmrnet_ekf.json."""
 
+from collections.abc import Mapping
+
 from benchmarks.result_table import Cell, Row, Table, WideRow
 
 _WAYS = {'rough': 'the guesses', 'cmrnet': 'CMRNet', 'mcd': 'MC dropout', 'de': 'deep ensemble',
@@ -36,6 +38,19 @@ def _localized(way: str, what: str) -> WideRow:
             Cell('{:.2f} m', (f'rejection.{way}.t_mean_m',)),
         ),
     )
+
+
+def _single_pass(title: str, ways: Mapping[str, str]) -> Table:
+    columns = (
+        title,
+        'error, median / mean',
+        'rotation',
+        'off by more than 1 m',
+        'calibration error x / y / yaw',
+        'mean error when the unsure are rejected',
+    )
+    rows = tuple(_localized(*way) for way in ways.items())
+    return Table('cmrnet_ekf', rows, columns, 'localization')
 
 
 def _calibrated(way: str, what: str) -> WideRow:
@@ -92,20 +107,8 @@ def _held(way: str, what: str, of: str = 'ekf') -> WideRow:
 
 
 LOCALIZATION_TABLES = {
-    'cmrnet': Table(
-        'cmrnet_ekf',
-        tuple(_localized(*way) for way in _WAYS.items()),
-        ('single pass', 'error, median / mean', 'rotation', 'off by more than 1 m',
-         'calibration error x / y / yaw', 'mean error when the unsure are rejected'),
-        'localization',
-    ),
-    'cmrnet_losses': Table(
-        'cmrnet_ekf',
-        tuple(_localized(*way) for way in _LOSSES.items()),
-        ('Table 5.2, single pass', 'error, median / mean', 'rotation', 'off by more than 1 m',
-         'calibration error x / y / yaw', 'mean error when the unsure are rejected'),
-        'localization',
-    ),
+    'cmrnet': _single_pass('single pass', _WAYS),
+    'cmrnet_losses': _single_pass('Table 5.2, single pass', _LOSSES),
     'cmrnet_calibration': Table(
         'cmrnet_ekf',
         tuple(_calibrated(*way) for way in {**_OF_UNCERTAIN, **_LOSSES}.items()),

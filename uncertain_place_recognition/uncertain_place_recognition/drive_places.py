@@ -19,19 +19,15 @@ from uncertain_place_recognition.relocalizer import Relocalized, Relocalizer, Re
 
 
 @config
-class AskedConfig:
+class AskedConfig(KeyframeConfig):
     """Which scans are asked about when odometry chooses them (follow: odom)."""
 
     distance: float = setting(3.0, 'travelled distance between scans', unit='m', low=0.1)
     angle: float = setting(0.5, 'turned angle between scans', unit='rad', low=0.01, high=3.15)
 
-    def selector(self) -> KeyframeSelector:
-        """Return what chooses scans by it."""
-        return KeyframeSelector(KeyframeConfig(self.distance, self.angle))
-
 
 @config
-class PlaceSpacingConfig:
+class PlaceSpacingConfig(KeyframeConfig):
     """How far apart places lie: as the submaps of the calibration, or its promises do not fit.
 
     What speaks against a match is told from the ten best, and in a denser map all ten are of one
@@ -40,10 +36,6 @@ class PlaceSpacingConfig:
 
     distance: float = setting(10.0, 'travelled distance between places', unit='m', low=0.1)
     angle: float = setting(0.5, 'turned angle between places', unit='rad', low=0.01, high=3.15)
-
-    def selector(self) -> KeyframeSelector:
-        """Return what chooses scans by it."""
-        return KeyframeSelector(KeyframeConfig(self.distance, self.angle))
 
 
 class DrivePlaces:
@@ -79,7 +71,7 @@ class DrivePlaces:
         self._relocalizer: Relocalizer | None = None
         self._newest_id = -1
         self._lock = threading.Lock()
-        self._spacing = None if spacing is None else spacing.selector()
+        self._spacing = None if spacing is None else KeyframeSelector(spacing)
         self.force_next = False
 
     @property

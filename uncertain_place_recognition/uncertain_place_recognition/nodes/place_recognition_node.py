@@ -43,6 +43,7 @@ from lcd_common.nodes.worker import Worker
 from lcd_common.priority import lower_priority
 from lcd_common.settings import config, setting
 from lcd_common.stamp_buffer import Paired, StampBuffer, StampedPose
+from lcd_loop_closure.keyframes import KeyframeSelector
 from lcd_loop_closure.nodes.odometry_message import odometry_pose
 from lcd_loop_closure.nodes.positions_message import positions_from_message
 from lcd_loop_closure.nodes.stream_watch import StreamWatch
@@ -119,7 +120,7 @@ class PlaceRecognitionNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('place_recognition', **node_options)
         self.config = declare_config(self, PlaceRecognitionNodeConfig)
-        self._selector = declare_config(self, AskedConfig, 'asked').selector()
+        self._selector = KeyframeSelector(declare_config(self, AskedConfig, 'asked'))
         self._spacing = declare_config(self, PlaceSpacingConfig, 'places')
         self._reduction = declare_config(self, ReductionConfig, 'reduction')
         self._relocalizer = declare_config(self, RelocalizerConfig, 'relocalizer')
