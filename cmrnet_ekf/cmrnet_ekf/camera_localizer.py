@@ -20,6 +20,8 @@ from lcd_common import se3
 from lcd_common.errors import ConfigError
 
 Pixels = NDArray[np.uint8]
+# A guess is in a stage's range when so many of its deviations are.
+_COVERED = 2.0
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,29 @@ class CameraLocalizer:
         self._T_base_body = T_base_camera @ T_OPTICAL_BODY
         self._imagers = [imager_of(self.framing.camera, p.settings, p.device) for p in stages]
 
+    def first_stage(self, covariance: se3.Array) -> int:
+        """Return the last stage that can refine a guess at once; 0 when the guess is not so sure.
+
+        Args:
+            covariance: 6x6 of the guess, translation first; two deviations must lie within what
+                the stage was trained for.
+        """
+        metres, radians = (
+            _COVERED * float(np.sqrt(np.linalg.eigvalsh(block)[-1]))
+            for block in (covariance[:3, :3], covariance[3:, 3:])
+        )
+        for stage in range(len(self.stages) - 1, 0, -1):
+            of = self.stages[stage].trained_for
+            if of is not None and metres <= of.translation_m and radians <= of.rotation_rad:
+                return stage
+        return 0
+
     def locate(
-        self, pixels: Pixels, points: NDArray[np.float32] | torch.Tensor, T_map_guess: se3.Array
+        self,
+        pixels: Pixels,
+        points: NDArray[np.float32] | torch.Tensor,
+        T_map_guess: se3.Array,
+        first: int = 0,
     ) -> PoseEstimate:
         """Return the pose by one image.
 
@@ -79,16 +102,21 @@ class CameraLocalizer:
             points: [N x 3] float32 of the map around the guess, map frame. With large coordinates
                 shift map and guess so that the vehicle is near the origin.
             T_map_guess: pose of base that is about right.
+            first: stage to begin with; see `first_stage`.
         """
-        return self.locate_framed(self.framing.image(pixels), points, T_map_guess)
+        return self.locate_framed(self.framing.image(pixels), points, T_map_guess, first)
 
     def locate_framed(
-        self, framed: Pixels, points: NDArray[np.float32] | torch.Tensor, T_map_guess: se3.Array
+        self,
+        framed: Pixels,
+        points: NDArray[np.float32] | torch.Tensor,
+        T_map_guess: se3.Array,
+        first: int = 0,
     ) -> PoseEstimate:
         """Return the pose by an image that has been through `framing` before; see `locate`."""
         image = torch.from_numpy(framed).permute(2, 0, 1)[None]
         T_map_body = T_map_guess @ self._T_base_body
-        for predictor, imager in zip(self.stages, self._imagers, strict=True):
+        for predictor, imager in zip(self.stages[first:], self._imagers[first:], strict=True):
             T_map_looked = T_map_body
             lidar = imager.image(points, T_OPTICAL_BODY @ se3.inverse(T_map_looked))
             belief = predictor.belief(image, lidar[None])

@@ -1,7 +1,8 @@
 """Predict poses with uncertainty: one network, MC dropout, a deep ensemble, or evidence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +14,13 @@ from cmrnet_ekf.networks.checkpoint import load_network
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.networks.outputs import Evidence, GaussianPose, Output, QuaternionPose
 from cmrnet_ekf.pose_belief import PoseBelief, gaussian_of_samples
+from cmrnet_ekf.pose_sampling import NoiseRange
 from lcd_common.errors import ConfigError, DataError
 from lcd_common.se3 import Array
 
-# The compact network with evidential regression, trained on simulated towns only; see its card.
-SHIPPED = Path(__file__).parent / 'weights' / 'der.safetensors'
+# Compact networks with evidential regression, one after the other; see their cards. Trained on
+# simulated towns only.
+SHIPPED = tuple(Path(__file__).parent / 'weights' / f'{name}.safetensors' for name in ('der',))
 
 
 class Predictor:
@@ -28,13 +31,20 @@ class Predictor:
     scale of 0: it does not know.
     """
 
-    def __init__(self, networks: Sequence[Cmrnet], samples: int = 30, seed: int = 0) -> None:
+    def __init__(
+        self,
+        networks: Sequence[Cmrnet],
+        samples: int = 30,
+        seed: int = 0,
+        trained_for: NoiseRange | None = None,
+    ) -> None:
         """Take networks that see the same images.
 
         Args:
             networks: one, or the members of an ensemble.
             samples: draws of MC dropout; 1 and less: no dropout.
             seed: of the draws; the same images give the same belief.
+            trained_for: how wrong the guesses were that they learned from; None: not known.
 
         Raises:
             ConfigError: there are none, or they do not fit together.
@@ -48,6 +58,7 @@ class Predictor:
         self.networks = [network.eval() for network in networks]
         self.settings = networks[0].settings
         self._samples, self._seed = samples, seed
+        self.trained_for = trained_for
         # Of the last shape of features: the seed draws the same every time.
         self._masks: tuple[tuple[torch.Size, torch.device], list[Tensor]] | None = None
 
@@ -63,8 +74,8 @@ class Predictor:
         Raises:
             DataError: there are none, or a file holds none.
         """
-        files = weights_in(path)
-        return cls([load_network(file, device)[0] for file in files], samples, seed)
+        loaded = [load_network(file, device) for file in weights_in(path)]
+        return cls([one for one, _ in loaded], samples, seed, _trained_for(loaded[0][1]))
 
     @property
     def kind(self) -> str:
@@ -77,7 +88,7 @@ class Predictor:
 
     def with_samples(self, samples: int) -> 'Predictor':
         """Return the same networks with another number of draws."""
-        return Predictor(self.networks, samples, self._seed)
+        return Predictor(self.networks, samples, self._seed, self.trained_for)
 
     @property
     def device(self) -> torch.device:
@@ -158,6 +169,12 @@ def weights_in(path: Path) -> list[Path]:
     if not files or not files[0].is_file():
         raise DataError(f'{path}: expected a .safetensors file or a folder of them, found none')
     return files
+
+
+def _trained_for(facts: Mapping[str, Any]) -> NoiseRange | None:
+    """Return the widest range of guesses that the facts of a file of weights name."""
+    ranges = [NoiseRange(float(m), float(np.deg2rad(d))) for m, d in facts.get('guesses_m_deg', ())]
+    return max(ranges, key=lambda one: one.translation_m, default=None)
 
 
 def means(output: Output) -> Array:

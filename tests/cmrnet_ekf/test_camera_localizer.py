@@ -12,7 +12,7 @@ from cmrnet_ekf.camera_localizer import CameraLocalizer, base_covariance
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.networks.config import COMPACT
 from cmrnet_ekf.pose_belief import PoseBelief
-from cmrnet_ekf.pose_sampling import T_OPTICAL_BODY
+from cmrnet_ekf.pose_sampling import T_OPTICAL_BODY, NoiseRange
 from cmrnet_ekf.predictors import Predictor
 from lcd_common import se3
 from lcd_common.errors import ConfigError
@@ -59,6 +59,26 @@ def test_corrections_are_applied_at_the_camera_one_after_the_other():
     assert torch.equal(stages[1].shown[0][1][0], expected)
     assert torch.equal(estimate.lidar, expected)
     assert estimate.fill == pytest.approx(float((expected > 0).float().mean()))
+
+
+def test_a_sure_guess_is_refined_by_the_last_network_alone():
+    T = se3.exp([0.1, 0, 0, 0, 0, 0.01])
+    stages = [Told(T) for _ in range(3)]
+    stages[1].trained_for, stages[2].trained_for = NoiseRange(1.0, 0.035), NoiseRange(0.6, 0.035)
+    localizer = CameraLocalizer(camera(), T_BASE_CAMERA, stages)
+    C = np.diag([0.25**2] * 3 + [0.01**2] * 3)
+    assert localizer.first_stage(C) == 2
+    C[0, 0] = 0.45**2
+    assert localizer.first_stage(C) == 1
+    C[0, 0] = C[1, 1] = 0.4**2
+    C[0, 1] = C[1, 0] = 0.15
+    assert localizer.first_stage(C) == 0, 'the deviation along the diagonal is 0.55 m'
+    assert localizer.first_stage(np.diag([0.1**2] * 3 + [0.02**2] * 3)) == 0
+    stages[1].trained_for = None
+    assert localizer.first_stage(np.diag([0.4**2] * 3 + [0.01**2] * 3)) == 0
+    points = street(np.random.default_rng(0))
+    localizer.locate(np.zeros((48, 96, 3), np.uint8), points, np.eye(4), first=2)
+    assert [len(one.shown) for one in stages] == [0, 0, 1]
 
 
 def test_the_covariance_is_that_of_drawn_poses():

@@ -1,4 +1,4 @@
-"""Track a drive by networks and the thesis's filter: the command `track_cmrnet`."""
+"""Track a drive by networks and a filter: the command `track_cmrnet`."""
 
 import argparse
 import json
@@ -16,8 +16,9 @@ from bags.inputs import span_ns
 from bags.records import Drive
 from cmrnet_ekf.evaluation.evaluate import RESULTS, results_folder
 from cmrnet_ekf.evaluation.named_networks import named_predictors
-from cmrnet_ekf.evaluation.tracking import Track, TrackingConfig
+from cmrnet_ekf.evaluation.tracking import THESIS, VEHICLE, Track, TrackingConfig
 from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive, record
+from cmrnet_ekf.evaluation.tracking_filters import VehicleTrackingConfig
 from cmrnet_ekf.evaluation.tracking_study import draw, figures_of, markdown, tracks, ways
 from cmrnet_ekf.mapping.local_map import LocalMap, LocalMapConfig
 from cmrnet_ekf.mapping.settings import MapConfig
@@ -38,12 +39,17 @@ examples:
       --second fine=runs/fine_der --out tracked          one stage beside two, each from the last
   track_cmrnet KITTI --sequence 00 --map maps/00 --networks der=runs/der --out tracked \\
       --set start_translation=1 speed_scale=0.02
+  track_cmrnet towns:200 --map maps/town_200 --networks der=runs/der --filter thesis --out thesis
 
 towns:N is a simulated town, mapped (into --map, if that is not there yet) on one run and driven on
-another. Each run starts at a wrong pose and has no satellites. The motion model gets the
-gyroscope's turns and wheels that err (--set); the camera is asked from what the filter predicts.
-Rows: the motion model alone; corrected by a plain network without a filter; the thesis's EKF with
-each network that says how sure it is (of several stages, the last one). Written are results.json,
+another. Each run starts at a wrong pose and has no satellites. The camera is asked from what the
+filter predicts; wheels err (--set). --filter vehicle: the EKF of this package, moved by inertial
+samples (--ekf sets what it is told of camera and wheels); thesis: Algorithm 2, moved by the
+gyroscope's turns and the wheels, which adds 0.5 m^2 to the variance at every image.
+Rows: the thesis's motion model alone; the vehicle's EKF without a camera (inertial); the motion
+model corrected by a plain network without a filter; the filter with each network that says how
+sure it is. Of several stages, those begin that are for guesses as sure as the filter's; the last
+one counts. Written are results.json,
 results.md, heat.png and tracks.npz; the images, as the networks take them, are kept in --frames and
 used again.
 """
@@ -60,21 +66,24 @@ def _track(arguments: argparse.Namespace) -> None:
     device = choose_device(arguments.device)
     networks = _staged([arguments.networks, arguments.second, arguments.third], device)
     settings = changed(TrackingConfig(), arguments.set)
+    told = changed(VehicleTrackingConfig(), arguments.ekf)
     first = next(iter(networks.values()))[0].settings
     drive = _recorded(arguments, first)
     local_map = LocalMap(arguments.map, LocalMapConfig(kept_tiles=2000))
-    chosen = ways(networks)
+    chosen = ways(networks, arguments.filter)
     runs = dict.fromkeys(chosen, arguments.runs)
     found: dict[str, list[Track]] = defaultdict(list)
     total = sum(runs.values()) * (len(drive) - 1)
     with tqdm(total=total, unit='image', disable=arguments.quiet) as bar:
-        for name, one in tracks(drive, local_map, chosen, runs, settings, bar.update):
+        for name, one in tracks(drive, local_map, chosen, runs, settings, told, bar.update):
             found[name].append(one)
     figures = {name: figures_of(of_way) for name, of_way in found.items()}
     out.mkdir(parents=True, exist_ok=True)
-    (out / RESULTS).write_text(json.dumps({'drive': drive.name, 'ways': figures}, indent=1) + '\n')
+    facts = {'drive': drive.name, 'filter': arguments.filter, 'ways': figures}
+    (out / RESULTS).write_text(json.dumps(facts, indent=1) + '\n')
     about = (
-        f'{drive.name}: {len(drive)} images over {drive.length_m:.0f} m; turns by {drive.turned_by}'
+        f'{drive.name}: {len(drive)} images over {drive.length_m:.0f} m; filter: '
+        f'{arguments.filter}; turns by {drive.turned_by}'
     )
     text = markdown(figures, about)
     draw(drive, found, out / 'heat.png')
@@ -146,7 +155,7 @@ def _drive(arguments: argparse.Namespace) -> Drive:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='track_cmrnet',
-        description="Track a drive in closed loop: CMRNet's networks and the thesis's EKF.",
+        description="Track a drive in closed loop: CMRNet's networks and an EKF.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -164,7 +173,10 @@ def _parser() -> argparse.ArgumentParser:
     add('--poses', type=Path, metavar='TUM', help='poses of base_link (default: ground truth)')
     add('--length', type=float, default=1200.0, metavar='M', help='of a town (default: 1200)')
     add('--runs', type=_count, default=3, help='of each way, seeds 0, 1, ... (default: 3)')
+    add('--filter', choices=(VEHICLE, THESIS), default=VEHICLE, help='(default: vehicle)')
     add('--set', nargs='+', default=[], metavar='NAME=VALUE', help='settings of starts and wheels')
+    add('--ekf', nargs='+', default=[], metavar='NAME=VALUE',
+        help="what the vehicle's EKF is told of camera and wheels")  # fmt: skip
     add('--device', default='auto', help='auto, cpu, cuda, cuda:1 ... (default: auto)')
     add('--quiet', action='store_true', help='no progress bars')
     return parser

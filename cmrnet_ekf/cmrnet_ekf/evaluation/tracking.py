@@ -1,4 +1,4 @@
-"""Track a vehicle by the thesis's filter in closed loop: what it looks from is what it predicted.
+"""Track a vehicle in closed loop: what it looks from is what the filter predicted.
 
 Thesis section 5.3.7 and Algorithm 2. No satellites; the start pose is wrong.
 """
@@ -11,15 +11,20 @@ import numpy as np
 from cmrnet_ekf import euler
 from cmrnet_ekf.camera_localizer import CameraLocalizer
 from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive
+from cmrnet_ekf.evaluation.tracking_filters import (
+    ThesisTracking,
+    VehicleTracking,
+    VehicleTrackingConfig,
+)
 from cmrnet_ekf.localization_errors import pose_errors
 from cmrnet_ekf.mapping.local_map import LocalMap, near_origin
 from cmrnet_ekf.pose_sampling import STAGES
 from cmrnet_ekf.predictors import Predictor
-from cmrnet_ekf.thesis_ekf import ThesisEkf, ThesisEkfConfig
 from lcd_common import se3
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
 
+THESIS, VEHICLE, UNFILTERED = 'thesis', 'vehicle', 'unfiltered'
 _LOST_M = 4.0  # about where nothing of a guess of the first stage's range is left
 
 
@@ -77,8 +82,9 @@ def track(
     stages: Sequence[Predictor],
     seed: int,
     *,
-    filtered: bool = True,
+    by: str = THESIS,
     settings: TrackingConfig | None = None,
+    told: VehicleTrackingConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> Track:
     """Drive once.
@@ -88,15 +94,17 @@ def track(
         local_map: of where it goes.
         stages: networks; none: the motion model alone.
         seed: of start pose and wheels.
-        filtered: with the thesis's EKF; else the camera's pose replaces the state.
+        by: the thesis's EKF, the vehicle's, or none: the camera's pose replaces the state.
         settings: of starts and wheels.
+        told: what the vehicle's EKF is told of its inputs.
         progress: called after each image.
 
     Raises:
         ConfigError: the networks take other images than the drive was recorded for, or the filter
-            is given a network that does not say how sure it is.
+            is given a network that does not say how sure it is, or the vehicle's EKF a drive
+            without inertial samples.
     """
-    s = settings or TrackingConfig()
+    s, filtered = settings or TrackingConfig(), by != UNFILTERED
     localizer = None
     if stages:
         if any(tuple(p.settings.images) != drive.images for p in stages) or local_map is None:
@@ -110,15 +118,18 @@ def track(
             )
         localizer = CameraLocalizer(drive.camera, drive.T_base_camera, stages)
     rng = np.random.default_rng([seed, 33])
-    ekf = ThesisEkf(ThesisEkfConfig(), drive.T_map_base[0] @ _start_error(rng, s))
+    start = drive.T_map_base[0] @ _start_error(rng, s)
+    ekf: ThesisTracking | VehicleTracking = ThesisTracking(drive, start)
+    if by == VEHICLE:
+        ekf = VehicleTracking(drive, start, told or VehicleTrackingConfig())
     speeds = drive.speeds_mps * (1.0 + s.speed_scale * rng.normal())
     speeds = speeds + s.speed_noise * rng.normal(size=len(drive))
     found, xi, covariances, skipped = [], [], [], 0
     for k in range(1, len(drive)):
-        dt_s = float(drive.stamps_ns[k] - drive.stamps_ns[k - 1]) * 1e-9
-        ekf.predict(float(speeds[k]), float(drive.turn_rates_radps[k]), dt_s)
+        ekf.move(k, float(speeds[k]))
         if localizer is not None and local_map is not None:
-            seen = _observation(localizer, local_map, drive.frames[k], ekf.T_map_base, s)
+            first = localizer.first_stage(ekf.covariance) if filtered else 0
+            seen = _observation(localizer, local_map, drive.frames[k], ekf.T_map_base, first, s)
             if seen is None or (filtered and not se3.is_covariance(seen[1])):
                 skipped += 1
             else:
@@ -126,9 +137,9 @@ def track(
                 xi.append(se3.log(se3.inverse(T_seen) @ drive.T_map_base[k]))
                 covariances.append(covariance)
                 if filtered:
-                    ekf.update(T_seen, component_covariance(T_seen, covariance))
+                    ekf.correct(k, T_seen, covariance)
                 else:
-                    ekf = ThesisEkf(ThesisEkfConfig(), T_seen)
+                    ekf = ThesisTracking(drive, T_seen)
         found.append(ekf.T_map_base)
         progress()
     T = np.array(found)
@@ -139,25 +150,20 @@ def track(
     )  # fmt: skip
 
 
-def component_covariance(T_map_base: se3.Array, covariance: se3.Array) -> se3.Array:
-    """Return the covariance of x y z roll pitch yaw, of one in body axes (translation first)."""
-    J = np.linalg.inv(euler.jacobian_to_body(euler.components(T_map_base)))
-    out = J @ covariance @ J.T
-    return np.asarray(0.5 * (out + out.T), np.float64)
-
-
 def _observation(
     localizer: CameraLocalizer,
     local_map: LocalMap,
     framed: np.ndarray,
     T_map_guess: se3.Array,
+    first: int,
     s: TrackingConfig,
 ) -> tuple[se3.Array, se3.Array] | None:
     """Return what the camera says from a prediction: T_map_base and its covariance."""
     points, origin = local_map.around(T_map_guess)
     if not len(points):
         return None
-    estimate = localizer.locate_framed(np.array(framed), points, near_origin(T_map_guess, origin))
+    T_near_guess = near_origin(T_map_guess, origin)
+    estimate = localizer.locate_framed(np.array(framed), points, T_near_guess, first)
     if estimate.fill < s.least_fill:
         return None
     return near_origin(estimate.T_map_base, -origin), estimate.covariance

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,25 @@ from lcd_common.errors import DataError
 from lcd_common.trajectory import Trajectory
 
 _FACTS = 'facts.json'
+_INERTIAL = ('imu_ns', 'turn_rates', 'forces', 'T_base_imu')
 _FRAMES = 'frames.raw'  # one behind the other: their number is known at the end
+
+
+@dataclass(frozen=True)
+class InertialTrack:
+    """What an inertial sensor felt along a drive, in its own axes.
+
+    Attributes:
+        stamps_ns: [N].
+        turn_rates: [N x 3] rad/s.
+        forces: [N x 3] m/s^2, +g up at rest.
+        T_base_imu: where it sits.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    turn_rates: se3.Array
+    forces: se3.Array
+    T_base_imu: se3.Array
 
 
 @dataclass(frozen=True)
@@ -34,6 +52,7 @@ class TrackingDrive:
         camera: of the frames.
         T_base_camera: where its optical frame sits.
         images: which images these are; see `CmrnetConfig.images`.
+        imu: None where the drive has none.
     """
 
     name: str
@@ -46,6 +65,7 @@ class TrackingDrive:
     camera: CameraModel
     T_base_camera: se3.Array
     images: tuple[float, ...]
+    imu: InertialTrack | None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -87,6 +107,7 @@ class TrackingDrive:
             camera,
             T_base_camera,
             tuple(facts['images']),
+            InertialTrack(*(arrays[name] for name in _INERTIAL)) if 'forces' in arrays else None,
         )
 
 
@@ -139,7 +160,8 @@ def record(
     T_step = se3.inverse(T[:-1]) @ T[1:]
     turned = np.array([se3.so3_log(one[:3, :3])[2] for one in T_step])
     rates, turned_by = turned / dt, 'truth'
-    measured = _turn_rates(drive, places, stamps_ns)
+    imu = inertial_track(drive, int(stamps_ns[0]), int(stamps_ns[-1]))
+    measured = None if imu is None else _turn_rates(imu, stamps_ns)
     if measured is not None:
         rates, turned_by = measured, 'imu'
     # The way along the arc; the chord is a little shorter.
@@ -152,6 +174,7 @@ def record(
         T_map_base=T,
         speeds_mps=np.r_[0.0, speeds],
         turn_rates_radps=np.r_[0.0, rates],
+        **({} if imu is None else dict(zip(_INERTIAL, astuple(imu), strict=True))),
     )
     facts = {
         'name': drive.name,
@@ -166,20 +189,29 @@ def record(
     return TrackingDrive.load(folder)
 
 
-def _turn_rates(
-    drive: Drive, places: dict[str, se3.Array], stamps_ns: NDArray[np.int64]
-) -> se3.Array | None:
-    """Return the gyroscope's mean turn rates between stamps [F - 1]; None where it is silent."""
-    times, rates = [], []
-    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
-    for sample in drive.records(first, last, kinds=[ImuSample]):
+def inertial_track(drive: Drive, start_ns: int, end_ns: int) -> InertialTrack | None:
+    """Return what the drive's inertial sensor felt in a time; None where nothing says."""
+    places = {m.child: m.T_parent_child for m in drive.mountings}
+    samples: list[ImuSample] = []
+    for sample in drive.records(start_ns, end_ns, kinds=[ImuSample]):
         assert isinstance(sample, ImuSample)
-        if sample.frame_id in places:
-            times.append(sample.stamp_ns)
-            rates.append((places[sample.frame_id][:3, :3] @ sample.angular_velocity)[2])
-    if not times:
+        # Of several sensors the first to speak.
+        if sample.frame_id in places and sample.frame_id == (samples or [sample])[0].frame_id:
+            samples.append(sample)
+    if not samples:
         return None
-    which = np.searchsorted(stamps_ns, np.array(times), side='right') - 1
+    return InertialTrack(
+        np.array([sample.stamp_ns for sample in samples], np.int64),
+        np.array([sample.angular_velocity for sample in samples]),
+        np.array([sample.linear_acceleration for sample in samples]),
+        places[samples[0].frame_id],
+    )
+
+
+def _turn_rates(imu: InertialTrack, stamps_ns: NDArray[np.int64]) -> se3.Array | None:
+    """Return the gyroscope's mean turn rates between stamps [F - 1]; None where it is silent."""
+    rates = (imu.turn_rates @ imu.T_base_imu[:3, :3].T)[:, 2]
+    which = np.searchsorted(stamps_ns, imu.stamps_ns, side='right') - 1
     counts = np.bincount(which, minlength=len(stamps_ns))[:-1]
     if not counts.all():
         return None

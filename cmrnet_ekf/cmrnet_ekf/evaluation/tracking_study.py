@@ -9,12 +9,20 @@ import numpy as np
 
 from cmrnet_ekf.evaluation.figure import figure
 from cmrnet_ekf.evaluation.tables import table
-from cmrnet_ekf.evaluation.tracking import Track, TrackingConfig, track
+from cmrnet_ekf.evaluation.tracking import (
+    THESIS,
+    UNFILTERED,
+    VEHICLE,
+    Track,
+    TrackingConfig,
+    track,
+)
 from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive
+from cmrnet_ekf.evaluation.tracking_filters import VehicleTrackingConfig
 from cmrnet_ekf.mapping.local_map import LocalMap
 from cmrnet_ekf.predictors import Predictor
 
-MOTION, UNFILTERED = 'motion', 'unfiltered'
+MOTION, INERTIAL = 'motion', 'inertial'
 _HOT_M = 2.0  # colours end there
 _COLUMNS = (
     ('t_max_m', 't max [m]', 2), ('t_mean_m', 't mean', 2), ('t_std_m', 't std', 2),
@@ -26,24 +34,27 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Way:
-    """A way of tracking: networks, one after the other, and whether a filter weighs them."""
+    """A way of tracking: networks, one after the other, and the filter that weighs them, if any."""
 
     stages: tuple[Predictor, ...] = ()
-    filtered: bool = True
+    by: str = THESIS
 
 
-def ways(networks: Mapping[str, Sequence[Predictor]]) -> dict[str, Way]:
+def ways(networks: Mapping[str, Sequence[Predictor]], by: str) -> dict[str, Way]:
     """Return the rows of the tables.
 
-    The motion model alone; the motion model corrected by the first network that does not know how
-    sure it is; the filter with each of the others.
+    The thesis's motion model alone; the vehicle's EKF without a camera, if that is the filter; the
+    motion model corrected by the first network that does not know how sure it is; the filter with
+    each of the others.
     """
     found = {MOTION: Way()}
+    if by == VEHICLE:
+        found[INERTIAL] = Way(by=VEHICLE)
     for name, stages in networks.items():
         if stages[-1].kind != 'plain':
-            found[name] = Way(tuple(stages))
+            found[name] = Way(tuple(stages), by)
         elif UNFILTERED not in found:
-            found[UNFILTERED] = Way(tuple(stages), filtered=False)
+            found[UNFILTERED] = Way(tuple(stages), UNFILTERED)
     return found
 
 
@@ -53,6 +64,7 @@ def tracks(
     chosen: Mapping[str, Way],
     runs: Mapping[str, int],
     settings: TrackingConfig | None = None,
+    told: VehicleTrackingConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> Iterator[tuple[str, Track]]:
     """Drive by each way, with seeds 0, 1, ... up to its number of runs; yield each at its end."""
@@ -61,7 +73,7 @@ def tracks(
             yield (
                 name,
                 track(
-                    drive, local_map, way.stages, seed, filtered=way.filtered, settings=settings,
+                    drive, local_map, way.stages, seed, by=way.by, settings=settings, told=told,
                     progress=progress,
                 ),
             )  # fmt: skip

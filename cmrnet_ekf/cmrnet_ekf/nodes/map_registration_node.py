@@ -67,8 +67,13 @@ class MapRegistrationConfig:
     weights: str = setting(
         '',
         'networks that refine one after the other, separated by commas: .safetensors files of '
-        'train_cmrnet, or folders of them as ensembles; empty: the one that ships (DER, trained on '
+        'train_cmrnet, or folders of them as ensembles; empty: those that ship (DER, trained on '
         'simulated towns only)',
+    )
+    skip_stages: bool = setting(
+        True,
+        'begin with the last network that was trained for guesses as wrong as the prediction may '
+        'be (two deviations); false: ask all, one after the other',
     )
     samples: int = setting(30, 'draws of MC dropout', low=2)
     base_frame: str = setting('base_link', 'frame of the vehicle')
@@ -103,7 +108,7 @@ class _Job:
     predicted: StampedPose
     localizer: CameraLocalizer
     map_frame: str
-    deviation_m: float
+    covariance: se3.Array | None
 
 
 class MapRegistrationNode(Node):
@@ -114,7 +119,8 @@ class MapRegistrationNode(Node):
         self.config = declare_config(self, MapRegistrationConfig)
         local_map = declare_config(self, LocalMapConfig, 'local_map')
         c = self.config
-        weights = [path.strip() for path in (c.weights or str(SHIPPED)).split(',')]
+        shipped = ','.join(map(str, SHIPPED))
+        weights = [path.strip() for path in (c.weights or shipped).split(',')]
         if not c.map:
             raise ConfigError(
                 'map_registration needs the parameter map, a folder: build_lidar_map makes one'
@@ -134,7 +140,8 @@ class MapRegistrationNode(Node):
         self._transforms = StaticTransforms(self)
         self._localizer: CameraLocalizer | None = None
         self._calibrated_by: CameraInfo | None = None
-        self._map_frame, self._deviation_m = 'map', 0.0
+        self._map_frame = 'map'
+        self._covariance: se3.Array | None = None
         self._buffer: StampBuffer[Image] = StampBuffer(
             c.waiting_images, round(c.max_prediction_gap * 1e9)
         )
@@ -204,8 +211,7 @@ class MapRegistrationNode(Node):
             self._map_frame = message.header.frame_id
             # A filter corrects between two poses: what is in between has no covariance of its own.
             if pose.covariance is not None:
-                largest = np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]
-                self._deviation_m = float(np.sqrt(largest))
+                self._covariance = pose.covariance
             self._pair(self._buffer.add_pose(pose))
 
     def destroy_node(self) -> None:
@@ -225,14 +231,18 @@ class MapRegistrationNode(Node):
         for pair in paired:
             assert self._localizer is not None
             self._jobs.put(
-                _Job(pair.item, pair.pose, self._localizer, self._map_frame, self._deviation_m)
+                _Job(pair.item, pair.pose, self._localizer, self._map_frame, self._covariance)
             )
 
     def _locate(self, job: _Job) -> None:
-        limit = self.config.max_deviation
-        if 0 < limit < job.deviation_m:
+        limit, deviation_m, first = self.config.max_deviation, 0.0, 0
+        if job.covariance is not None:
+            deviation_m = float(np.sqrt(np.linalg.eigvalsh(job.covariance[:3, :3])[-1]))
+            if self.config.skip_stages:
+                first = job.localizer.first_stage(job.covariance)
+        if 0 < limit < deviation_m:
             text = (
-                f'the prediction may be off by {job.deviation_m:.1f} m, too uncertain to refine '
+                f'the prediction may be off by {deviation_m:.1f} m, too uncertain to refine '
                 f'(max_deviation {limit:g} m): tell ekf where the vehicle is (initialpose)'
             )
             self._reject('images', 'prediction too uncertain', text)
@@ -244,7 +254,7 @@ class MapRegistrationNode(Node):
                 pixels = image_from_message(job.image)
                 points, origin = self._map.around(job.predicted.T_odom_base)
                 T_near_guess = near_origin(job.predicted.T_odom_base, origin)
-                estimate = job.localizer.locate(pixels, points, T_near_guess)
+                estimate = job.localizer.locate(pixels, points, T_near_guess, first)
             except DataError as error:
                 self._reject('images', 'unusable', str(error))
                 return

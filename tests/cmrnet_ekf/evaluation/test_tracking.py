@@ -10,8 +10,9 @@ from small_samples import CAMERA, SMALL, T_BASE_CAMERA, StreetWithCamera, street
 from bags.records import ImuSample, Mounting
 from cmrnet_ekf import euler
 from cmrnet_ekf.evaluation import track as command
-from cmrnet_ekf.evaluation.tracking import Track, TrackingConfig, component_covariance, track
+from cmrnet_ekf.evaluation.tracking import THESIS, UNFILTERED, VEHICLE, Track, TrackingConfig, track
 from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive, record
+from cmrnet_ekf.evaluation.tracking_filters import component_covariance
 from cmrnet_ekf.evaluation.tracking_study import figures_of, ways
 from cmrnet_ekf.networks.checkpoint import save_network
 from cmrnet_ekf.networks.cmrnet import Cmrnet
@@ -27,7 +28,7 @@ EXACT = TrackingConfig(speed_scale=0.0, speed_noise=0.0)
 
 
 class BendWithImu(StreetWithCamera):
-    """The same images along a bend of constant turn rate, with a gyroscope that tells it."""
+    """The same images along a bend of constant turn rate, with an inertial sensor that tells it."""
 
     name, turn_rate = 'bend', 0.2
     mountings = (
@@ -47,8 +48,9 @@ class BendWithImu(StreetWithCamera):
             yield from super().records(start_ns, end_ns, kinds)
             return
         for stamp_ns in range(start_ns, end_ns + 1, 10**7):
-            # The sensor hangs upside down.
-            yield ImuSample(stamp_ns, np.array([0.0, 0, -self.turn_rate]), np.zeros(3))
+            # The sensor hangs upside down: y to the right, z down.
+            force = np.array([0.0, -15.0 * self.turn_rate, -9.81])
+            yield ImuSample(stamp_ns, np.array([0.0, 0, -self.turn_rate]), force)
 
 
 class Oracle(Predictor):
@@ -72,20 +74,21 @@ class Oracle(Predictor):
 @pytest.fixture
 def oracle(tmp_path, monkeypatch):
     """Make an oracle that is told from where the localizer looks."""
-    drive = record(tmp_path / 'frames', StreetWithCamera(), StreetWithCamera().truth(), SMALL)
 
-    def make(scale):
+    def make(scale, street=None):
+        street = street or StreetWithCamera()
+        drive = record(tmp_path / 'frames', street, street.truth(), SMALL)
         predictor = Oracle(drive, np.asarray(scale))
         from cmrnet_ekf.camera_localizer import CameraLocalizer
 
         ask = CameraLocalizer.locate_framed
 
-        def locate(self, framed, points, T_map_guess):
+        def locate(self, framed, points, T_map_guess, first):
             # Points and guess are told from a tile's corner.
             T = T_map_guess.copy()
             T[:2, 3] += predictor.origin[:2]
             predictor.T_map_looked = T @ T_BASE_CAMERA @ T_OPTICAL_BODY
-            return ask(self, framed, points, T_map_guess)
+            return ask(self, framed, points, T_map_guess, first)
 
         monkeypatch.setattr(CameraLocalizer, 'locate_framed', locate)
         local_map = street_map(tmp_path / 'map')
@@ -131,10 +134,10 @@ def test_wrong_starts_differ_by_seed_and_stay_without_a_camera(tmp_path):
     np.testing.assert_array_equal(one.metres, again.metres)
 
 
-@pytest.mark.parametrize('filtered', [True, False])
-def test_a_camera_that_knows_takes_the_error_away(oracle, filtered):
+@pytest.mark.parametrize('by', [THESIS, UNFILTERED])
+def test_a_camera_that_knows_takes_the_error_away(oracle, by):
     drive, local_map, predictor = oracle(np.full(6, 1e-4))
-    found = track(drive, local_map, [predictor], 3, filtered=filtered, settings=EXACT)
+    found = track(drive, local_map, [predictor], 3, by=by, settings=EXACT)
     # The camera is a metre from base: its yaw error counts there too.
     assert found.metres.max() < 2e-3 and found.radians.max() < 2e-3
     assert found.skipped == 0 and len(found.xi) == 9
@@ -150,6 +153,34 @@ def test_the_errors_that_come_with_observations_fit_their_covariances(oracle):
     filtered = np.concatenate([r.metres for r in runs])
     raw = np.linalg.norm(xi[:, :3], axis=1)
     assert filtered.mean() < raw.mean() * 1.05
+
+
+def test_the_vehicles_filter_moves_by_inertial_samples(tmp_path):
+    bend = BendWithImu()
+    drive = record(tmp_path, bend, bend.truth(), SMALL)
+    assert drive.imu.forces.shape == (91, 3)
+    right = replace(EXACT, start_translation=0.0, start_rotation=0.0)
+    found = track(drive, None, [], 0, by=VEHICLE, settings=right)
+    assert found.metres.max() < 0.02 and found.radians.max() < 2e-3
+    # Without the sensor's place it would feel gravity the wrong way up.
+    hung = replace(drive, imu=replace(drive.imu, T_base_imu=np.eye(4)))
+    assert track(hung, None, [], 0, by=VEHICLE, settings=right).metres.max() > 0.5
+
+
+def test_the_vehicles_filter_takes_a_wrong_start_away(oracle):
+    scale = np.array([0.2, 0.1, 0.05, 0.01, 0.02, 0.03])
+    drive, local_map, predictor = oracle(scale, BendWithImu())
+    runs = [track(drive, local_map, [predictor], n, by=VEHICLE, settings=EXACT) for n in range(8)]
+    last = np.array([r.metres[-1] for r in runs])
+    assert last.max() < 0.5
+    assert np.mean(last) < np.mean([np.linalg.norm(r.xi[:, :3], axis=1).mean() for r in runs])
+
+
+def test_the_vehicles_filter_needs_inertial_samples(tmp_path):
+    drive = record(tmp_path, StreetWithCamera(), StreetWithCamera().truth(), SMALL)
+    assert drive.imu is None
+    with pytest.raises(ConfigError, match='needs inertial samples'):
+        track(drive, None, [], 0, by=VEHICLE)
 
 
 def test_covariances_of_components_are_those_of_drawn_poses():
@@ -189,9 +220,12 @@ def test_ways_are_the_rows_of_the_table():
         'mcd': [Predictor([Cmrnet(replace(SMALL, dropout=0.3))])],
         'der': [Predictor([Cmrnet(replace(SMALL, head='evidential'))])],
     }
-    found = ways(networks)
+    found = ways(networks, THESIS)
     assert list(found) == ['motion', 'unfiltered', 'mcd', 'der']
-    assert not found['unfiltered'].filtered and found['der'].filtered
+    assert found['unfiltered'].by == UNFILTERED and found['der'].by == THESIS
+    found = ways(networks, VEHICLE)
+    assert list(found) == ['motion', 'inertial', 'unfiltered', 'mcd', 'der']
+    assert found['motion'].by == THESIS and found['der'].by == found['inertial'].by == VEHICLE
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
@@ -216,6 +250,7 @@ def test_the_command_tracks_with_networks(tmp_path, monkeypatch, capsys):
         save_network(tmp_path / f'{role}.safetensors', Cmrnet(replace(SMALL, head=head)), {})
     out = tmp_path / 'out'
     line = ['made_up', '--map', f'{tmp_path}/map', '--out', str(out), '--runs', '2', '--quiet']
+    line += ['--filter', 'thesis']
     line += [
         '--networks',
         f'cmrnet={tmp_path}/plain.safetensors',
@@ -237,6 +272,9 @@ def test_the_command_tracks_with_networks(tmp_path, monkeypatch, capsys):
     assert 'unfiltered' in capsys.readouterr().out
     assert command.main([*line, '--set', 'speed=1']) == 1
     assert 'no setting' in capsys.readouterr().err
+    assert command.main([*line, '--filter', 'vehicle']) == 1
+    error = capsys.readouterr().err
+    assert 'inertial samples' in error and error.count('\n') == 1, error
 
 
 def truth_positions():
@@ -255,7 +293,9 @@ def command_line(tmp_path, monkeypatch):
     }.items():  # fmt: skip
         save_network(tmp_path / f'{name}.safetensors', Cmrnet(config), {})
     monkeypatch.chdir(tmp_path)
-    return ['made_up', '--map', 'map', '--out', 'out', '--runs', '1', '--quiet']
+    return [
+        'made_up', '--map', 'map', '--out', 'out', '--runs', '1', '--quiet', '--filter', 'thesis',
+    ]  # fmt: skip
 
 
 def test_the_command_refines_in_stages(command_line, monkeypatch):
@@ -275,7 +315,7 @@ def test_the_command_refines_in_stages(command_line, monkeypatch):
     assert command.main(line) == 0
     counts = {name: len(way.stages) for name, way in seen.items()}
     assert counts == {'motion': 0, 'der': 1, 'deep': 3, 'rough_first': 2}
-    assert seen['rough_first'].filtered, 'the last network says how sure it is'
+    assert seen['rough_first'].by == THESIS, 'the last network says how sure it is'
     assert [p.kind for p in seen['rough_first'].stages] == ['plain', 'der']
     with open('out/results.json') as file:
         assert list(json.load(file)['ways']) == list(counts)
