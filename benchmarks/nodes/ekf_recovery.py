@@ -32,6 +32,7 @@ class _Vehicle:
                 odometry='',
                 fixes='',
                 publish_rate=10.0,
+                camera__correlation_time=0.0,  # the errors made here are independent
                 motion__accelerometer_noise=MOTION.accelerometer_noise,
                 motion__gyroscope_noise=MOTION.gyroscope_noise,
                 motion__accelerometer_walk=MOTION.accelerometer_walk,

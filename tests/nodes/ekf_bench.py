@@ -22,7 +22,8 @@ T_BASE_IMU = se3.from_rotation_translation(se3.so3_exp([0.1, -0.05, 0.8]), [0.3,
 T_BASE_ANTENNA = se3.from_rotation_translation(np.eye(3), [-0.4, 0.1, 1.5])
 CAMERA = np.diag(np.array([0.2, 0.1, 0.1, 0.004, 0.004, 0.006]) ** 2)
 # A noise-free drive: its samples are never frozen, however smooth they are.
-QUIET = {'frozen_imu': 0, 'fixes': '', 'odometry': ''}
+# The errors that these inputs are given are independent.
+QUIET = {'frozen_imu': 0, 'fixes': '', 'odometry': '', 'camera.correlation_time': 0.0}
 
 
 def base_pose(k: int) -> se3.Array:

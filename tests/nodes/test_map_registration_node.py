@@ -146,6 +146,34 @@ def at(x: float) -> np.ndarray:
     return se3.from_rotation_translation(se3.so3_exp([0, 0, 0.1]), FAR + np.array([x, 0.5, 0.0]))
 
 
+@pytest.mark.parametrize(
+    ('deviation', 'changes', 'asked'),
+    [(0.3, {}, [2.0, 1.0]), (0.01, {}, [1.0]), (0.01, {'skip_stages': False}, [2.0, 1.0])],
+)
+def test_a_sure_prediction_goes_to_the_last_network_alone(
+    told: Callable[..., Fed], files: tuple[Path, Path], monkeypatch: Any,
+    deviation: float, changes: dict[str, object], asked: list[float],
+) -> None:  # fmt: skip
+    paths = [files[1].with_name(f'stage_{metres:.0f}.safetensors') for metres in (2.0, 1.0)]
+    for path, metres, degrees in zip(paths, (2.0, 1.0), (10.0, 2.0), strict=True):
+        save_network(path, Cmrnet(SMALL), {'guesses_m_deg': [[metres, degrees]]})
+    fed = told(weights=','.join(map(str, paths)), **changes)
+    answer, seen = Predictor.belief, []
+
+    def counted(self: Predictor, image: Any, lidar: Any) -> PoseBelief:
+        seen.append(self.trained_for.translation_m)
+        return answer(self, image, lidar)
+
+    monkeypatch.setattr(Predictor, 'belief', counted)
+    fed.mount()
+    fed.info(0)
+    fed.image(1)
+    T = se3.from_rotation_translation(np.eye(3), FAR)
+    for step in (0.5, 1.5):
+        fed.predict(step, T, deviation)
+    assert len(fed.poses) == 1 and seen == asked
+
+
 def test_an_image_becomes_a_pose_of_the_vehicle_with_covariance(told: Callable[..., Fed]) -> None:
     fed = told()
     fed.mount()

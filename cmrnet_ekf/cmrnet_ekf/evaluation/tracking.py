@@ -55,6 +55,7 @@ class Track:
         seed: of the start and of the wheels' noise.
         T_map_base: [F x 4 x 4] of the filter.
         metres, radians: [F] errors.
+        nees: [F] normalised estimation errors squared of the filter's poses, 6 when it is right.
         xi: [M x 6] T_true = T_observed exp(xi) of the camera's observations, as they came.
         covariances: [M x 6 x 6] that came with them, body axes; zero of a network that does not
             know.
@@ -65,6 +66,7 @@ class Track:
     T_map_base: se3.Array
     metres: se3.Array
     radians: se3.Array
+    nees: se3.Array
     xi: se3.Array
     covariances: se3.Array
     skipped: int
@@ -124,7 +126,7 @@ def track(
         ekf = VehicleTracking(drive, start, told or VehicleTrackingConfig())
     speeds = drive.speeds_mps * (1.0 + s.speed_scale * rng.normal())
     speeds = speeds + s.speed_noise * rng.normal(size=len(drive))
-    found, xi, covariances, skipped = [], [], [], 0
+    found, nees, xi, covariances, skipped = [], [], [], [], 0
     for k in range(1, len(drive)):
         ekf.move(k, float(speeds[k]))
         if localizer is not None and local_map is not None:
@@ -141,11 +143,12 @@ def track(
                 else:
                     ekf = ThesisTracking(drive, T_seen)
         found.append(ekf.T_map_base)
+        nees.append(ekf.nees(drive.T_map_base[k]))
         progress()
     T = np.array(found)
     metres, radians = pose_errors(drive.T_map_base[1:], T)
     return Track(
-        seed, T, metres, radians, np.array(xi).reshape(-1, 6),
+        seed, T, metres, radians, np.array(nees), np.array(xi).reshape(-1, 6),
         np.array(covariances).reshape(-1, 6, 6), skipped,
     )  # fmt: skip
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cmrnet_ekf import euler
+from cmrnet_ekf.ekf.consistency import nees
 from cmrnet_ekf.ekf.ekf_settings import ConstraintConfig, EkfSettings, StartConfig
 from cmrnet_ekf.ekf.observations import PoseObservation, TwistObservation
 from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
 from cmrnet_ekf.evaluation.tracking_drive import TrackingDrive
-from cmrnet_ekf.thesis_ekf import ThesisEkf, ThesisEkfConfig
+from cmrnet_ekf.thesis_ekf import ThesisEkf, ThesisEkfConfig, pose_vector, wrapped
 from lcd_common import se3
 from lcd_common.errors import ConfigError
 from lcd_common.settings import config, setting
@@ -35,6 +36,11 @@ class ThesisTracking:
         """Covariance 6x6 of the pose, body axes of base (the thesis's: of x y z roll pitch yaw)."""
         return self._ekf.covariance
 
+    def nees(self, T_map_base_true: se3.Array) -> float:
+        """Return the normalised estimation error squared of the pose: 6 on average when right."""
+        error = wrapped(pose_vector(T_map_base_true) - pose_vector(self.T_map_base))
+        return float(error @ np.linalg.solve(self.covariance, error))
+
     def move(self, k: int, speed_mps: float) -> None:
         """Move from image k - 1 to image k; the wheels say how fast."""
         stamps_ns = self._drive.stamps_ns
@@ -53,6 +59,7 @@ class VehicleTrackingConfig:
     camera_correlation: float = setting(
         1.0, 'errors of camera poses fade in this time', unit='s', low=0.0
     )
+    camera_scale: float = setting(1.0, 'factor on the covariances of camera poses', low=1e-3)
     wheel_sigma: float = setting(0.15, 'of the speed by the wheels', unit='m/s', low=1e-3)
     wheel_correlation: float = setting(
         1.0, 'errors of the wheels fade in this time', unit='s', low=0.0
@@ -110,6 +117,10 @@ class VehicleTracking:
         Ad = se3.adjoint(self._imu.T_base_imu)
         return np.asarray(Ad @ estimate.covariance @ Ad.T, np.float64)
 
+    def nees(self, T_map_base_true: se3.Array) -> float:
+        """See `ThesisTracking`."""
+        return nees(self.T_map_base, self.covariance, T_map_base_true)
+
     def move(self, k: int, speed_mps: float) -> None:
         """See `ThesisTracking`."""
         imu, s, stamp_ns = self._imu, self._settings, int(self._drive.stamps_ns[k])
@@ -127,10 +138,11 @@ class VehicleTracking:
 
     def correct(self, k: int, T_map_base: se3.Array, covariance: se3.Array) -> None:
         """See `ThesisTracking`."""
+        s = self._settings
         self._ekf.observe(
             PoseObservation(
-                int(self._drive.stamps_ns[k]), _CAMERA, T_map_base, covariance, self._T_imu_base,
-                correlation_s=self._settings.camera_correlation,
+                int(self._drive.stamps_ns[k]), _CAMERA, T_map_base, s.camera_scale * covariance,
+                self._T_imu_base, correlation_s=s.camera_correlation,
             )
         )  # fmt: skip
 

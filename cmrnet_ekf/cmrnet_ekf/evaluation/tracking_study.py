@@ -27,7 +27,7 @@ _HOT_M = 2.0  # colours end there
 _COLUMNS = (
     ('t_max_m', 't max [m]', 2), ('t_mean_m', 't mean', 2), ('t_std_m', 't std', 2),
     ('t_median_m', 't median', 2), ('r_max_deg', 'r max [°]', 1), ('r_mean_deg', 'r mean', 2),
-    ('r_median_deg', 'r median', 2), ('runs', 'runs', 0), ('diverged', 'diverged', 0),
+    ('r_median_deg', 'r median', 2), ('nees_mean', 'NEES', 1), ('runs', 'runs', 0), ('diverged', 'diverged', 0),
     ('skipped_share', 'not seen', 3),
 )  # fmt: skip
 
@@ -92,6 +92,7 @@ def figures_of(found: Sequence[Track]) -> dict[str, Any]:
         'r_mean_deg': float(degrees.mean()),
         'r_std_deg': float(degrees.std()),
         'r_median_deg': float(np.median(degrees)),
+        'nees_mean': float(np.mean([one.nees.mean() for one in found])),
         'runs': len(found),
         'diverged': sum(one.diverged for one in found),
         'skipped_share': sum(one.skipped for one in found) / len(metres),

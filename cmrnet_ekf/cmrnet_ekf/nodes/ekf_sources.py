@@ -107,7 +107,7 @@ class EkfSources:
                 stamp_ns,
                 name,
                 T_map_base,
-                covariance,
+                settings.covariance_scale * covariance,
                 node.T_body_base,
                 axes,
                 settings.correlation_time,

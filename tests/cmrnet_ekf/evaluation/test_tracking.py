@@ -200,7 +200,8 @@ def made_track(metres, degrees, seed=0) -> Track:
     metres = np.asarray(metres, float)
     nothing = np.zeros((0, 6)), np.zeros((0, 6, 6))
     T = np.tile(np.eye(4), (len(metres), 1, 1))
-    return Track(seed, T, metres, np.deg2rad(degrees), *nothing, skipped=1)
+    nees = 2.0 * metres
+    return Track(seed, T, metres, np.deg2rad(degrees), nees, *nothing, skipped=1)
 
 
 def test_figures_count_all_images_of_all_runs():
@@ -209,6 +210,7 @@ def test_figures_count_all_images_of_all_runs():
     assert found['t_max_m'] == 9.0 and found['t_mean_m'] == 4.0 and found['t_median_m'] == 3.5
     assert found['r_median_deg'] == pytest.approx(1.5) and found['r_max_deg'] == pytest.approx(8.0)
     assert (found['runs'], found['diverged']) == (2, 1)
+    assert found['nees_mean'] == 8.0
     assert found['skipped_share'] == pytest.approx(2 / 6)
     back = made_track([*[20.0] * 50, *[0.5] * 50], np.ones(100))
     assert not back.diverged, 'it found back'
