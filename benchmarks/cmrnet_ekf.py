@@ -10,8 +10,8 @@ CMRNET_WEIGHTS names the folder of trained networks, one for each role: cmrnet, 
 that is missing is left out. What else is there (nll, covariance) is judged beside them, and
 second/<role> and third/<role> refine in stages. A role is a .safetensors file, a folder of
 train_cmrnet, or, as an ensemble, a folder of such. What the work folder holds is not made again:
-with it, consistency is also measured with the errors that ekf's cameras made. Exits with 1 when a
-section failed or a required figure is missing.
+with it, consistency is also measured with the errors that the networks of ekf made in all stages.
+Exits with 1 when a section failed or a required figure is missing.
 """
 
 import sys
@@ -83,7 +83,7 @@ def sections(quick: bool = False) -> dict[str, tuple[str, Section]]:
             partial(cmrnet_methods.rejection, quick=quick),
         ),
         'ekf': (
-            "closed loop: motion model, no filter, the thesis's EKF with each network",
+            "closed loop: motion model, no filter, the vehicle's and the thesis's EKF by network",
             partial(cmrnet_tracking.evaluate, quick=quick),
         ),
         'consistency': (

@@ -90,14 +90,18 @@ def samples(
         yield SampleSet(out)
 
 
-def tracked(work: Path, network: CmrnetConfig, quick: bool) -> tuple[TrackingDrive, LocalMap]:
-    """Return the drive that is tracked, rendered once, and its map."""
-    length_m = 100.0 if quick else TRACKED_M
-    drive = seen_town(TRACKED_TOWN, length_m, imu='rt3003')
-    local_map = town_map(work, TRACKED_TOWN, length_m)
-    folder = work / 'tracked' / f'town_{TRACKED_TOWN}_{length_m:.0f}m'
-    with tqdm(unit='image', desc='frames') as bar:
-        return record(folder, drive, drive.truth(), network, progress=bar.update), local_map
+def tracked(
+    work: Path, network: CmrnetConfig, town: int, length_m: float
+) -> tuple[TrackingDrive, LocalMap]:
+    """Return a drive that is tracked, rendered once, and its map."""
+    drive = seen_town(town, length_m, imu='rt3003')
+    local_map = town_map(work, town, length_m)
+    name = f'town_{town}_{length_m:.0f}m'
+    with tqdm(unit='image', desc=f'frames of {name}') as bar:
+        recorded = record(
+            work / 'tracked' / name, drive, drive.truth(), network, progress=bar.update
+        )
+    return recorded, local_map
 
 
 def town_map(work: Path, town: int, length_m: float) -> LocalMap:

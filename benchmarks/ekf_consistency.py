@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.camera_errors import CameraErrors, camera_errors, in_closed_loop
 from benchmarks.ekf_drive import ImuRecord, ReferenceDrive, reference_drive, sense
 from cmrnet_ekf.ekf.consistency import anees, autocorrelation, nees
 from cmrnet_ekf.ekf.ekf_settings import EkfSettings, GateConfig, MotionConfig, StartConfig
@@ -22,6 +23,7 @@ from cmrnet_ekf.ekf.observations import (
 )
 from cmrnet_ekf.ekf.update import Verdict
 from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
+from cmrnet_ekf.evaluation.tracking_filters import VehicleTrackingConfig
 from lcd_common import se3
 
 MOTION = MotionConfig(
@@ -35,24 +37,8 @@ GNSS_SIGMAS = np.array([1.5, 1.5, 3.0])
 ANTENNA = np.array([-0.5, 0.3, 1.2])
 SPEED_SIGMA = 0.1
 _SETTLING_S = 2.0
-_STARTING = 20  # images
 _GROUP = 50  # runs
-TRACKS = 'heat_tracks.npz'  # of the section `ekf`, in the work folder
-
-
-@dataclass(frozen=True)
-class CameraErrors:
-    """Errors of a real camera localization, in place of simulated ones.
-
-    Attributes:
-        xi: [sequences x N x 6], T_true = T_observed exp(xi), in the order in which they came.
-        covariances: [sequences x N x 6 x 6] that came with them.
-        correlation_s: what the filter is told of their correlation.
-    """
-
-    xi: se3.Array
-    covariances: se3.Array
-    correlation_s: float = 0.0
+TRACKS = 'refined_tracks.npz'  # end of the names of what the section `ekf` leaves
 
 
 @dataclass
@@ -64,20 +50,20 @@ class RunRecord:
 
 
 def observations(
-    drive: ReferenceDrive, rng: np.random.Generator, camera: CameraErrors | None = None
+    drive: ReferenceDrive,
+    rng: np.random.Generator,
+    camera: CameraErrors | None = None,
+    stretch: int = 0,
 ) -> Iterator[Observation]:
     """Yield what camera (10 Hz), wheels (10 Hz) and GNSS (1 Hz) see, in the order of stamps."""
-    sequence = None
-    if camera is not None:
-        sequence = rng.integers(len(camera.xi)), rng.integers(camera.xi.shape[1])
     seen = 0
     for k in range(0, len(drive.stamps_ns), 5):
         stamp_ns, T = int(drive.stamps_ns[k]), drive.T_map_body[k]
         if k % 10 == 0:
             xi, covariance = rng.normal(size=6) * CAMERA_SIGMAS, np.diag(CAMERA_SIGMAS**2)
-            if camera is not None and sequence is not None:
-                at = (sequence[1] + seen) % camera.xi.shape[1]
-                xi, covariance = camera.xi[sequence[0], at], camera.covariances[sequence[0], at]
+            if camera is not None:
+                of, at = stretch % len(camera.xi), seen % camera.xi.shape[1]
+                xi, covariance = camera.xi[of, at], camera.covariances[of, at]
             seen += 1
             # T_true = T_observed exp(xi)
             yield PoseObservation(
@@ -135,7 +121,7 @@ def run_once(drive: ReferenceDrive, seed: int, camera: CameraErrors | None = Non
     ekf = begun(drive, rng, settings())
     record = RunRecord()
     ekf.on_verdict = lambda verdict: record.verdicts[verdict.source].append(verdict)
-    coming = observations(drive, rng, camera)
+    coming = observations(drive, rng, camera, seed)
     following: Observation | None = next(coming)
     for k, stamp_ns in enumerate(drive.stamps_ns.tolist()):
         ekf.add_imu(stamp_ns, imu.turn_rates[k], imu.forces[k])
@@ -240,42 +226,17 @@ def order_invariance(seconds: float = 10.0) -> dict[str, Any]:
     }
 
 
-def camera_errors(tracks: Path, way: str = 'der') -> CameraErrors | None:
-    """Return the errors that a way of the closed loop made; None when it has not been driven.
-
-    Each run is a sequence, without the two seconds in which the wrong start is taken away.
-    """
-    if not tracks.is_file():
-        return None
-    with np.load(tracks, allow_pickle=False) as kept:
-        names = [name[: -len('_xi')] for name in kept.files if name.endswith('_xi')]
-        names = [name for name in names if name.rpartition('_')[0] == way]
-        xi = [kept[f'{name}_xi'][_STARTING:] for name in names]
-        covariances = [kept[f'{name}_covariance'][_STARTING:] for name in names]
-    length = min((len(one) for one in xi), default=0)
-    if not length:
-        return None
-    return CameraErrors(
-        np.array([one[:length] for one in xi]), np.array([one[:length] for one in covariances])
-    )
-
-
-def with_real_errors(camera: CameraErrors, runs: int) -> dict[str, Any]:
+def with_real_errors(camera: CameraErrors, runs: int, correlation_s: float) -> dict[str, Any]:
     """Return consistency with a camera's own errors and covariances, by what is told of them.
 
-    Errors of one scene last: both are shown, independent ones and such that fade in a second.
+    Errors of one scene last: taken for independent, and for such that fade. Each run has a stretch
+    of its own, as long as it lasts.
     """
-    flat, C = camera.xi.reshape(-1, 6), camera.covariances.reshape(-1, 6, 6)
-    own = np.einsum('ni,nij,nj->n', flat, np.linalg.inv(C), flat)
-    figures: dict[str, Any] = {
-        'sequences': len(camera.xi),
-        'observations': len(flat),
-        'nees_of_observations_mean': float(own.mean()),
-        'nees_of_observations_median': float(np.median(own)),
+    seconds = camera.xi.shape[1] * 0.1
+    return {
+        name: consistency(runs, seconds, replace(camera, correlation_s=told))
+        for name, told in (('independent', 0.0), ('as_told', correlation_s))
     }
-    for name, seconds in (('independent', 0.0), ('correlated_1s', 1.0)):
-        figures[name] = consistency(runs, camera=replace(camera, correlation_s=seconds))
-    return figures
 
 
 def section(work: Path, runs: int = 200) -> dict[str, Any]:
@@ -289,7 +250,12 @@ def section(work: Path, runs: int = 200) -> dict[str, Any]:
         'recovered': all(case['recovered'] for case in recovered.values()),
         'recovery': recovered,
     }
-    camera = camera_errors(work / TRACKS)
+    told = VehicleTrackingConfig()
+    camera = camera_errors(sorted(work.glob(f'*{TRACKS}')))
     if camera is not None:
-        figures['with_cmrnet'] = with_real_errors(camera, min(runs, _GROUP))
+        scaled = replace(camera, covariances=told.camera_scale * camera.covariances)
+        figures['with_cmrnet'] = {
+            'closed_loop': in_closed_loop(camera),
+            **with_real_errors(scaled, min(runs, _GROUP), told.camera_correlation),
+        }
     return {'consistency': figures, **speed()}

@@ -18,6 +18,7 @@ from benchmarks import (
     ekf_consistency,
     report,
 )
+from benchmarks.camera_errors import camera_errors, in_closed_loop
 from cmrnet_ekf.evaluation.study import Study
 from cmrnet_ekf.lidar_image.imager import LidarImager
 from cmrnet_ekf.lidar_image.settings import LidarImageConfig
@@ -29,7 +30,7 @@ from lcd_common.errors import DataError
 
 sys.path.append(str(Path(__file__).parents[1] / 'cmrnet_ekf'))
 from evaluation_cases import known_answers, perfect_answers
-from small_samples import SMALL, StreetWithCamera, street_map
+from small_samples import SMALL, BendWithImu, street_map
 
 METHODS = ('localization', 'calibration', 'rejection')
 
@@ -135,7 +136,7 @@ def test_without_weights_a_section_says_so(monkeypatch, tmp_path):
 
 
 def test_the_closed_loop_has_its_required_figures(weights, monkeypatch, tmp_path):
-    street = StreetWithCamera()
+    street = BendWithImu()
     street_map(tmp_path / 'map')
 
     def town_map(work, town, length_m):
@@ -149,9 +150,12 @@ def test_the_closed_loop_has_its_required_figures(weights, monkeypatch, tmp_path
     absent = report.missing(figures, cmrnet_ekf.REQUIRED)
     assert not [key for key in absent if key.startswith('ekf.')]
     assert figures['ekf']['conditions']['images'] == 10
-    assert list(figures['ekf']['refined']) == ['motion', 'der']
-    errors = ekf_consistency.camera_errors(tmp_path / ekf_consistency.TRACKS, 'motion')
-    assert errors is None, 'no camera, no errors'
+    assert list(figures['ekf']['thesis']) == ['mcd', 'de', 'der']
+    assert list(figures['ekf']['refined']) == ['der']
+    towns = figures['ekf']['towns']
+    assert towns['der']['runs'] == towns[street.name]['runs'] == 1
+    files = {path.name for path in tmp_path.glob(f'*{ekf_consistency.TRACKS}')}
+    assert files == {'refined_tracks.npz', f'{street.name}_refined_tracks.npz'}
     assert cmrnet_tracking.RUNS_DER >= 20 and cmrnet_sets.TRACKED_M >= 1000.0
     assert (tmp_path / 'pictures' / 'cmrnet' / 'heat.png').is_file()
 
@@ -173,15 +177,23 @@ def test_errors_of_the_closed_loop_become_those_of_the_filters_camera(tmp_path):
     rng = np.random.default_rng(0)
     sigmas = np.array([0.2, 0.1, 0.1, 0.01, 0.01, 0.02])
     arrays = {}
-    for seed, count in enumerate((60, 50)):
+    for seed, count in enumerate((300, 180)):
         arrays[f'der_{seed}_xi'] = rng.normal(size=(count, 6)) * sigmas
         arrays[f'der_{seed}_covariance'] = np.tile(np.diag(sigmas**2), (count, 1, 1))
-        arrays[f'de_{seed}_xi'] = np.ones((count, 6))
-        arrays[f'de_{seed}_covariance'] = np.tile(np.eye(6), (count, 1, 1))
+        arrays[f'der_{seed}_nees'] = rng.chisquare(6, count + 3)
+        for what in ('xi', 'covariance', 'nees'):
+            arrays[f'de_{seed}_{what}'] = np.ones_like(arrays[f'der_{seed}_{what}'])
     np.savez(tmp_path / 'tracks.npz', **arrays)
-    camera = ekf_consistency.camera_errors(tmp_path / 'tracks.npz')
-    assert camera is not None and camera.xi.shape == (2, 30, 6)
-    np.testing.assert_array_equal(camera.xi[1], arrays['der_1_xi'][20:])
-    found = ekf_consistency.consistency(3, 6.0, camera)
+    camera = camera_errors([tmp_path / 'tracks.npz', tmp_path / 'none.npz'])
+    assert camera is not None and camera.xi.shape == (5, 80, 6)
+    np.testing.assert_array_equal(camera.xi[1], arrays['der_0_xi'][100:180])
+    np.testing.assert_array_equal(camera.xi[4], arrays['der_1_xi'][100:180])
+    np.testing.assert_array_equal(camera.nees[3], arrays['der_1_nees'][20:100])
+    found = ekf_consistency.consistency(3, 8.0, camera)
     assert found['nis_camera'] == pytest.approx(6.0, abs=1.5)
-    assert ekf_consistency.camera_errors(tmp_path / 'none.npz') is None
+    closed = in_closed_loop(camera)
+    assert closed['stretches'] == 5
+    assert closed['nees_of_observations_mean'] == pytest.approx(6.0, abs=0.6)
+    assert closed['anees_mean'] == pytest.approx(camera.nees.mean())
+    assert abs(closed['autocorrelation_of_observations']['1_s']) < 0.1
+    assert camera_errors([tmp_path / 'none.npz']) is None

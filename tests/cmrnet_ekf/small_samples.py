@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from camera_scenes import ground, wall
 
-from bags.records import CameraImage, CameraModel, Mounting
+from bags.records import CameraImage, CameraModel, ImuSample, Mounting
 from cmrnet_ekf.mapping.local_map import LocalMap
 from cmrnet_ekf.mapping.map_builder import MapBuilder
 from cmrnet_ekf.mapping.settings import MapConfig
@@ -52,6 +52,32 @@ class StreetWithCamera:
                 return
             if (start_ns or 0) <= stamp_ns <= (end_ns or 10**18):
                 yield self.image(index)
+
+
+class BendWithImu(StreetWithCamera):
+    """The same images along a bend of constant turn rate, with an inertial sensor that tells it."""
+
+    name, turn_rate = 'bend', 0.2
+    mountings = (
+        *StreetWithCamera.mountings,
+        Mounting('base_link', 'imu', np.diag([1.0, -1, -1, 1])),
+    )
+
+    def truth(self) -> Trajectory:
+        yaw = self.turn_rate * np.arange(10) * 0.1
+        radius = 15.0 / self.turn_rate
+        T = np.array([se3.rotation_z(float(y)) for y in yaw])
+        T[:, 0, 3], T[:, 1, 3] = radius * np.sin(yaw), radius * (1 - np.cos(yaw))
+        return Trajectory(self.stamps_ns, T)
+
+    def records(self, start_ns=None, end_ns=None, kinds=()):
+        if ImuSample not in kinds:
+            yield from super().records(start_ns, end_ns, kinds)
+            return
+        for stamp_ns in range(start_ns, end_ns + 1, 10**7):
+            # The sensor hangs upside down: y to the right, z down.
+            force = np.array([0.0, -15.0 * self.turn_rate, -9.81])
+            yield ImuSample(stamp_ns, np.array([0.0, 0, -self.turn_rate]), force)
 
 
 def street_map(folder: Path) -> LocalMap:

@@ -94,11 +94,12 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def write_tracks(found: dict[str, list[Track]], path: Path) -> None:
-    """Write WAY_SEED_pose [F x 4 x 4], and the errors of the camera's observations."""
+    """Write WAY_SEED_pose [F x 4 x 4] with its NEES, and the errors of camera observations."""
     arrays = {}
     for name, of_way in found.items():
         for one in of_way:
             arrays[f'{name}_{one.seed}_pose'] = one.T_map_base
+            arrays[f'{name}_{one.seed}_nees'] = one.nees
             arrays[f'{name}_{one.seed}_xi'] = one.xi
             arrays[f'{name}_{one.seed}_covariance'] = one.covariances
     np.savez_compressed(path, allow_pickle=False, **arrays)

@@ -27,8 +27,8 @@ _HOT_M = 2.0  # colours end there
 _COLUMNS = (
     ('t_max_m', 't max [m]', 2), ('t_mean_m', 't mean', 2), ('t_std_m', 't std', 2),
     ('t_median_m', 't median', 2), ('r_max_deg', 'r max [°]', 1), ('r_mean_deg', 'r mean', 2),
-    ('r_median_deg', 'r median', 2), ('nees_mean', 'NEES', 1), ('runs', 'runs', 0), ('diverged', 'diverged', 0),
-    ('skipped_share', 'not seen', 3),
+    ('r_median_deg', 'r median', 2), ('nees_mean', 'NEES', 1), ('runs', 'runs', 0),
+    ('diverged', 'diverged', 0), ('skipped_share', 'not seen', 3),
 )  # fmt: skip
 
 

@@ -28,10 +28,12 @@ class PoseInputConfig:
         0.0, 'instead of the covariance that comes with it; 0: that one', unit='rad', low=0.0
     )
     covariance_scale: float = setting(
-        1.0, 'factor on its covariance (track_cmrnet --ekf camera_scale=... tells by NEES)', low=1e-6
+        1.0,
+        'factor on its covariance; track_cmrnet --ekf camera_scale=... shows the NEES',
+        low=1e-6,
     )
     correlation_time: float = setting(
-        2.0,
+        1.0,
         'errors fade in this time, and count the less: those against a map last while the scene '
         'does; 0: independent',
         unit='s',

@@ -5,9 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_samples import CAMERA, SMALL, T_BASE_CAMERA, StreetWithCamera, street_map
+from small_samples import (
+    CAMERA,
+    SMALL,
+    T_BASE_CAMERA,
+    BendWithImu,
+    StreetWithCamera,
+    street_map,
+)
 
-from bags.records import ImuSample, Mounting
 from cmrnet_ekf import euler
 from cmrnet_ekf.evaluation import track as command
 from cmrnet_ekf.evaluation.tracking import THESIS, UNFILTERED, VEHICLE, Track, TrackingConfig, track
@@ -22,35 +28,8 @@ from cmrnet_ekf.predictors import Predictor
 from cmrnet_ekf.thesis_ekf import pose_matrix, pose_vector
 from lcd_common import se3
 from lcd_common.errors import ConfigError, DataError
-from lcd_common.trajectory import Trajectory
 
 EXACT = TrackingConfig(speed_scale=0.0, speed_noise=0.0)
-
-
-class BendWithImu(StreetWithCamera):
-    """The same images along a bend of constant turn rate, with an inertial sensor that tells it."""
-
-    name, turn_rate = 'bend', 0.2
-    mountings = (
-        *StreetWithCamera.mountings,
-        Mounting('base_link', 'imu', np.diag([1.0, -1, -1, 1])),
-    )
-
-    def truth(self) -> Trajectory:
-        yaw = self.turn_rate * np.arange(10) * 0.1
-        radius = 15.0 / self.turn_rate
-        T = np.array([se3.rotation_z(float(y)) for y in yaw])
-        T[:, 0, 3], T[:, 1, 3] = radius * np.sin(yaw), radius * (1 - np.cos(yaw))
-        return Trajectory(self.stamps_ns, T)
-
-    def records(self, start_ns=None, end_ns=None, kinds=()):
-        if ImuSample not in kinds:
-            yield from super().records(start_ns, end_ns, kinds)
-            return
-        for stamp_ns in range(start_ns, end_ns + 1, 10**7):
-            # The sensor hangs upside down: y to the right, z down.
-            force = np.array([0.0, -15.0 * self.turn_rate, -9.81])
-            yield ImuSample(stamp_ns, np.array([0.0, 0, -self.turn_rate]), force)
 
 
 class Oracle(Predictor):
