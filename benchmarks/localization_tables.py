@@ -12,11 +12,17 @@ _LOSSES = {'der_thesis': "thesis's L^D, in metres and radians", 'nll': 'negative
 _UNCERTAIN = (*_OF_UNCERTAIN, *_LOSSES)
 _REFINED = {way: _WAYS[way] for way in ('cmrnet', 'der')}
 _TRACKED = {
-    'motion': 'motion model alone',
-    'unfiltered': 'CMRNet without a filter',
+    'motion': "thesis's motion model alone",
+    'inertial': 'IMU and wheels alone',
+    'unfiltered': 'motion model, CMRNet without a filter',
     'mcd': 'EKF, MC dropout',
     'de': 'EKF, deep ensemble',
     'der': 'EKF, evidential regression',
+    'refined.der': '— in stages (what `map_registration` does)',
+    'towns.der': '— in stages, three other towns of 600 m',
+    'thesis.mcd': "thesis's filter, MC dropout",
+    'thesis.de': "thesis's filter, deep ensemble",
+    'thesis.der': "thesis's filter, evidential regression",
 }
 
 
@@ -79,7 +85,8 @@ def _rejected(way: str, what: str) -> WideRow:
 
 
 def _refined(way: str, what: str) -> WideRow:
-    stages = (f'localization.{way}', f'localization.refined.{way}.after_stage_2')
+    refined = f'localization.refined.{way}'
+    stages = (f'localization.{way}', *(f'{refined}.after_stage_{stage}' for stage in (2, 3)))
     return WideRow(
         what,
         tuple(
@@ -89,8 +96,8 @@ def _refined(way: str, what: str) -> WideRow:
     )
 
 
-def _held(way: str, what: str, of: str = 'ekf') -> WideRow:
-    figures = f'{of}.{way}'
+def _held(way: str, what: str) -> WideRow:
+    figures = f'ekf.{way}'
     return WideRow(
         what,
         (
@@ -101,6 +108,7 @@ def _held(way: str, what: str, of: str = 'ekf') -> WideRow:
                     ('r_median_deg', '°'),
                 )
             ),
+            Cell('{:.1f}', (f'{figures}.nees_mean',)),
             Cell('{:.0f} of {:.0f}', (f'{figures}.diverged', f'{figures}.runs')),
         ),
     )  # fmt: skip
@@ -125,15 +133,13 @@ LOCALIZATION_TABLES = {
     'cmrnet_refined': Table(
         'cmrnet_ekf',
         tuple(_refined(*way) for way in _REFINED.items()),
-        ('in stages, median', 'single pass', 'and the second network'),
+        ('in stages, median', 'single pass', 'and the second network', 'and the third'),
         'localization',
     ),
     'tracking': Table(
         'cmrnet_ekf',
-        (*(_held(*way) for way in _TRACKED.items()),
-         *(_held(way, f'in two stages: {_TRACKED[way]}', 'ekf.refined')
-           for way in ('unfiltered', 'der'))),
-        ('closed loop', 'median', 'mean', 'largest', 'rotation, median', 'lost'),
+        tuple(_held(*way) for way in _TRACKED.items()),
+        ('closed loop', 'median', 'mean', 'largest', 'rotation, median', 'NEES of 6', 'lost'),
         'ekf',
     ),
     'ekf': Table('cmrnet_ekf', (
