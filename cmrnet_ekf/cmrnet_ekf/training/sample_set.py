@@ -9,45 +9,22 @@ places.npy     [F x 4 x 4] T_map_camera, axes forward, left, up (sets of before 
 """
 
 import json
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from bags.records import CameraModel
 from cmrnet_ekf.pose_sampling import targets
+from cmrnet_ekf.training.augmentation import augmented
+from cmrnet_ekf.training.batch import Batch
 from lcd_common.errors import DataError
 from lcd_common.se3 import Array
 
 FORMAT, VERSION = 'cmrnet_samples', 1
 FULL_SCALE = 65535
-# What a mirror does to x y z roll pitch yaw.
-_MIRRORED = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-
-
-@dataclass(frozen=True)
-class Batch:
-    """What a step of training sees.
-
-    Attributes:
-        image, lidar: see `Cmrnet.trunk`.
-        target: [B x 6] components of T_guess_camera.
-        camera: [B x 4] fx fy cx cy, pixels; NaN where they are not known.
-    """
-
-    image: Tensor
-    lidar: Tensor
-    target: Tensor
-    camera: Tensor
-
-    def to(self, device: torch.device) -> 'Batch':
-        """Return the batch on a device."""
-        parts = (self.image, self.lidar, self.target, self.camera)
-        return Batch(*(part.to(device) for part in parts))
 
 
 class SampleSet:
@@ -123,11 +100,16 @@ class SampleSet:
         return bool(self._pinhole.isfinite().all())
 
 
-def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment: bool) -> Batch:
+def draw(
+    sets: 'list[SampleSet]', count: int, rng: np.random.Generator, roll: float | None = None
+) -> Batch:
     """Return samples drawn from several sets, each sample as likely as any other.
 
-    With `augment` each is mirrored with a probability of a half, and its brightness, contrast and
-    saturation vary by a tenth, as CMRNet's.
+    Args:
+        sets: to draw from.
+        count: how many.
+        rng: draws.
+        roll: largest roll of `augmented`, radians; None: samples as they are.
     """
     ends = np.cumsum([len(one) for one in sets])
     chosen = np.sort(rng.integers(0, ends[-1], count))
@@ -139,37 +121,4 @@ def draw(sets: 'list[SampleSet]', count: int, rng: np.random.Generator, augment:
         torch.cat([p.target for p in parts]),
         torch.cat([p.camera for p in parts]),
     )
-    if not augment:
-        return batch
-    image = jittered(batch.image.float(), rng)
-    mirror = torch.from_numpy(rng.random(count) < 0.5)
-    return mirrored(replace(batch, image=image), mirror)
-
-
-def mirrored(batch: Batch, which: Tensor) -> Batch:
-    """Return the batch with some samples [B] as a mirror would show the street.
-
-    Both images are flipped: the flipped LiDAR image is what a camera with a mirrored principal
-    point sees of the mirrored map.
-    """
-    keep = which.view(-1, 1, 1, 1)
-    fx, fy, cx, cy = batch.camera.unbind(1)
-    flipped = torch.stack([fx, fy, batch.image.shape[3] - 1 - cx, cy], 1)
-    return Batch(
-        torch.where(keep, batch.image.flip(3), batch.image),
-        torch.where(keep[:, 0], batch.lidar.flip(2), batch.lidar),
-        torch.where(which.view(-1, 1), batch.target * _MIRRORED, batch.target),
-        torch.where(which.view(-1, 1), flipped, batch.camera),
-    )
-
-
-def jittered(image: Tensor, rng: np.random.Generator, amount: float = 0.1) -> Tensor:
-    """Return images [B x 3 x H x W], 0..255, with other brightness, contrast and saturation."""
-    factors = torch.from_numpy(rng.uniform(1 - amount, 1 + amount, (3, len(image), 1, 1, 1)))
-    brightness, contrast, saturation = factors.float()
-    image = image * brightness
-    image = (image - image.mean((1, 2, 3), keepdim=True)) * contrast + image.mean(
-        (1, 2, 3), keepdim=True
-    )
-    grey = image.mean(1, keepdim=True)
-    return ((image - grey) * saturation + grey).clamp(0.0, 255.0)
+    return batch if roll is None else augmented(batch, rng, roll)

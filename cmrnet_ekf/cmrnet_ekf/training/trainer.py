@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from cmrnet_ekf.networks.cmrnet import Cmrnet
 from cmrnet_ekf.networks.losses import LossConfig, pose_losses
 from cmrnet_ekf.networks.matching import cell_matches, matching_loss
-from cmrnet_ekf.training.sample_set import Batch, SampleSet, draw
+from cmrnet_ekf.training.batch import Batch
+from cmrnet_ekf.training.sample_set import SampleSet, draw
 from lcd_common import weights_file
 from lcd_common.errors import ConfigError, LocalizationError
 from lcd_common.settings import config, setting
@@ -34,7 +35,10 @@ class TrainingConfig:
     schedule: str = setting(
         'constant', 'constant, or cosine: down to a hundredth', choices=('constant', 'cosine')
     )
-    augment: bool = setting(True, 'mirror and vary colours')
+    augment: bool = setting(True, 'mirror, vary colours, and roll')
+    roll: float = setting(
+        5.0, 'largest roll of both images when augmented', unit='deg', low=0.0, high=45.0
+    )
     clip: float = setting(10.0, 'largest norm of the gradient; 0: none', low=0.0)
     half: bool = setting(False, 'mixed precision (bfloat16); the heads stay in full')
     checkpoint_every: int = setting(500, 'batches between checkpoints', low=1)
@@ -82,10 +86,12 @@ class Trainer:
                     f'{one.path}: samples of images {one.images}, the network takes '
                     f'{network.settings.images}; make samples for this network'
                 )
-            if loss.matching_weight and not one.pinhole:
+            rolls = settings.augment and settings.roll > 0.0
+            if (loss.matching_weight or rolls) and not one.pinhole:
                 raise ConfigError(
-                    f'{one.path}: the matching loss needs images without distortion and samples '
-                    'that say of which camera; rectify them, or set matching_weight to 0'
+                    f'{one.path}: the matching loss and rolled images need images without '
+                    'distortion and samples that say of which camera; rectify them, or set '
+                    '--loss matching_weight=0 and --train roll=0'
                 )
         self.device = torch.device(device)
         self.network = network.to(self.device)
@@ -158,7 +164,8 @@ class Trainer:
         # By step, so that a resumed training draws what it would have drawn.
         rng = np.random.default_rng([s.seed, self.step])
         torch.manual_seed(int(rng.integers(1 << 62)))
-        batch = draw(self._sets, s.batch, rng, s.augment).to(self.device)
+        roll = float(np.deg2rad(s.roll)) if s.augment else None
+        batch = draw(self._sets, s.batch, rng, roll).to(self.device)
         for group in self.optimizer.param_groups:
             group['lr'] = self._learning_rate()
         self.network.train()

@@ -7,7 +7,9 @@ from cmrnet_ekf.networks.losses import LossConfig
 from cmrnet_ekf.training.trainer import TrainingConfig
 
 # A small network learns faster, and two CPU cores do not wait for 190,000 batches.
-_QUICK = TrainingConfig(steps=12000, batch=8, learning_rate=1e-3, schedule='cosine', half=True)
+_QUICK = TrainingConfig(
+    steps=12000, batch=8, learning_rate=1e-3, schedule='cosine', half=True, roll=0.0
+)
 NETWORKS: dict[str, tuple[CmrnetConfig, TrainingConfig]] = {
     'full': (FULL, TrainingConfig()),
     'compact': (COMPACT, _QUICK),
