@@ -62,6 +62,21 @@ def test_a_camera_that_is_too_sure_is_noticed() -> None:
     assert _mean_nees(4, CameraErrors(xi, covariances, np.ones((1, 500)))) > 10.0
 
 
+def test_errors_that_last_need_to_be_told() -> None:
+    """A camera that is off by the same amount for eight seconds, a different one in each run."""
+    sigmas = ekf_consistency.CAMERA_SIGMAS
+    xi = np.repeat(np.random.default_rng(0).normal(size=(4, 1, 6)) * sigmas, 40, axis=1)
+    covariances = np.tile(np.diag(sigmas**2), (4, 40, 1, 1))
+    camera = CameraErrors(xi, covariances, np.ones((4, 40)))
+    found = ekf_consistency.with_real_errors(camera, 4, correlation_s=4.0)
+    assert found['as_told']['anees_mean'] < 0.5 * found['independent']['anees_mean']
+    assert found['as_told']['seconds'] == found['independent']['seconds'] == 4.0
+
+
+def test_the_order_of_arrival_does_not_matter() -> None:
+    assert ekf_consistency.order_invariance(3.0)['order_difference'] == 0.0
+
+
 def test_the_drive_is_what_its_samples_say() -> None:
     """Integrating the samples gives the poses: the benchmark's truth is a truth."""
     drive = reference_drive(5.0)
