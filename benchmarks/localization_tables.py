@@ -143,7 +143,7 @@ LOCALIZATION_TABLES = {
         'ekf',
     ),
     'ekf': Table('cmrnet_ekf', (
-        Row('Closed loop, 1.2 km without satellites, from wrong starts, DER in stages: median error',
+        Row('Closed loop, 1.2 km, no satellites, wrong starts, DER in stages: median error',
             '{:.2f} m', ('ekf.refined.der.t_median_m',), '≤ 0.32 m'),
         Row('— single pass', '{:.2f} m', ('ekf.der.t_median_m',), '≤ 0.32 m'),
         Row('— lost, in stages / single pass / by the filter of the thesis, of 20 runs each',
