@@ -121,11 +121,11 @@ def track(
         localizer = CameraLocalizer(drive.camera, drive.T_base_camera, stages)
     rng = np.random.default_rng([seed, 33])
     start = drive.T_map_base[0] @ _start_error(rng, s)
-    ekf: ThesisTracking | VehicleTracking = ThesisTracking(drive, start)
-    if by == VEHICLE:
-        ekf = VehicleTracking(drive, start, told or VehicleTrackingConfig())
     speeds = drive.speeds_mps * (1.0 + s.speed_scale * rng.normal())
     speeds = speeds + s.speed_noise * rng.normal(size=len(drive))
+    ekf: ThesisTracking | VehicleTracking = ThesisTracking(drive, start)
+    if by == VEHICLE:
+        ekf = VehicleTracking(drive, start, float(speeds[1]), told or VehicleTrackingConfig())
     found, nees, xi, covariances, skipped = [], [], [], [], 0
     for k in range(1, len(drive)):
         ekf.move(k, float(speeds[k]))

@@ -1,7 +1,5 @@
 """Move and correct a vehicle in a tracking run: by the thesis's filter, or by the suite's own."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from cmrnet_ekf import euler
@@ -17,6 +15,11 @@ from lcd_common.settings import config, setting
 
 _AHEAD = (True, *(False,) * 5)
 _CAMERA, _WHEELS = 'camera', 'wheels'
+_SETTINGS = EkfSettings(
+    constraint=ConstraintConfig(nonholonomic=True),
+    # Of errors that are uniform within 2 m and 10 degrees.
+    start=StartConfig(position=1.15, rotation=0.1, velocity=1.0),
+)
 
 
 class ThesisTracking:
@@ -66,24 +69,17 @@ class VehicleTrackingConfig:
     )
 
 
-@dataclass(frozen=True)
-class _Settings:
-    ekf: EkfSettings = field(
-        default_factory=lambda: EkfSettings(
-            constraint=ConstraintConfig(nonholonomic=True),
-            # Of errors that are uniform within 2 m and 10 degrees.
-            start=StartConfig(position=1.15, rotation=0.1, velocity=1.0),
-        )
-    )
-
-
 class VehicleTracking:
     """The vehicle's EKF: inertial samples move it, wheels and camera correct it."""
 
     def __init__(
-        self, drive: TrackingDrive, T_map_base: se3.Array, settings: VehicleTrackingConfig
+        self,
+        drive: TrackingDrive,
+        T_map_base: se3.Array,
+        speed_mps: float,
+        settings: VehicleTrackingConfig,
     ) -> None:
-        """Start at a pose at the first image.
+        """Start at the first image, at a pose, as fast as the wheels say.
 
         Raises:
             ConfigError: the drive has no inertial sensor.
@@ -95,11 +91,10 @@ class VehicleTracking:
             )
         self._drive, self._imu, self._settings = drive, drive.imu, settings
         self._T_imu_base = se3.inverse(self._imu.T_base_imu)
-        self._ekf = VehicleEkf(_Settings().ekf, self._T_imu_base)
+        self._ekf = VehicleEkf(_SETTINGS, self._T_imu_base)
         T_map_imu = T_map_base @ self._imu.T_base_imu
         start_ns = int(drive.stamps_ns[0])
-        ahead = T_map_base[:3, 0] * float(drive.speeds_mps[1])
-        self._ekf.start(start_ns, T_map_imu, velocity_map=ahead)
+        self._ekf.start(start_ns, T_map_imu, velocity_map=T_map_base[:3, 0] * speed_mps)
         self._next = int(np.searchsorted(self._imu.stamps_ns, start_ns))
 
     @property
