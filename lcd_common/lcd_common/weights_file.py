@@ -1,5 +1,6 @@
 """Keep tensors, networks and the state of training in safetensors: nothing is unpickled."""
 
+import errno
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,8 +45,11 @@ def read(
             names = list(file.keys())
             facts = json.loads((file.metadata() or {})['facts'])
             return Stored({name: file.get_tensor(name) for name in names}, facts)
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        # The library's own names no file, and commands tell people which one is missing.
+        raise FileNotFoundError(
+            errno.ENOENT, f'no such file; expected weights that {writer} wrote', str(path)
+        ) from error
     except Exception as error:
         raise DataError(
             f'{path} holds no weights of this suite ({error}); expected a .safetensors file that '

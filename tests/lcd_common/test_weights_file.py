@@ -2,12 +2,14 @@
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
 from lcd_common import weights_file
+from lcd_common.command_line import run
 from lcd_common.errors import DataError
 
 
@@ -73,6 +75,15 @@ def test_safetensors_of_others_are_refused(tmp_path: Path) -> None:
         weights_file.read(path)
 
 
-def test_a_missing_file_stays_a_missing_file(tmp_path: Path) -> None:
+def test_a_missing_file_stays_a_missing_file_and_is_named(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / 'none.safetensors'
     with pytest.raises(FileNotFoundError):
-        weights_file.read(tmp_path / 'none.safetensors')
+        weights_file.read(path)
+
+    def command() -> None:
+        weights_file.read(path, writer='train_it')
+
+    assert run(command) == 1
+    assert capsys.readouterr().err == (
+        f'error: {path}: no such file; expected weights that train_it wrote\n'
+    )
