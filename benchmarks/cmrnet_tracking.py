@@ -61,7 +61,7 @@ def part(work: Path, name: str, quick: bool = False) -> dict[str, Any]:
     chosen = {
         way: how
         for way, how in ways(found, by).items()
-        if name == 'vehicle' or (how.stages and (how.by == by or name == 'refined'))
+        if name == 'vehicle' or (how.stages and how.by == by)
     }
     if not chosen:
         return {}

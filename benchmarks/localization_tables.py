@@ -146,7 +146,7 @@ LOCALIZATION_TABLES = {
         Row('Closed loop, 1.2 km, no satellites, wrong starts, DER in stages: median error',
             '{:.2f} m', ('ekf.refined.der.t_median_m',), '≤ 0.32 m'),
         Row('— single pass', '{:.2f} m', ('ekf.der.t_median_m',), '≤ 0.32 m'),
-        Row('— lost, in stages / single pass / by the filter of the thesis, of 20 runs each',
+        Row("— lost, of 20 runs each: in stages / single pass / single pass, thesis's filter",
             '{:.0f} / {:.0f} / {:.0f}',
             ('ekf.refined.der.diverged', 'ekf.der.diverged', 'ekf.thesis.der.diverged'), '0'),
         Row('Epochs with ANEES inside the 95 % band, groups of 50 runs', '{:.1f} %',
