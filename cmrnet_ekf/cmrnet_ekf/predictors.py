@@ -21,7 +21,8 @@ from lcd_common.se3 import Array
 # Compact networks with evidential regression, one after the other; see their cards. Trained on
 # simulated towns only.
 SHIPPED = tuple(
-    Path(__file__).parent / 'weights' / f'{name}.safetensors' for name in ('der', 'second/der')
+    Path(__file__).parent / 'weights' / f'{name}.safetensors'
+    for name in ('der', 'second/der', 'third/der')
 )
 
 
