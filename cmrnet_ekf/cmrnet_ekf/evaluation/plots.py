@@ -115,10 +115,13 @@ def _counts(study: Study, path: Path) -> Path:
 
 def _stretch(stretch: Stretch, path: Path) -> Path:
     """Fig. 5.6: where each method put the frames; what it rejected is grey and hollow."""
-    count = len(stretch.located)
-    with figure(path, (_PANEL * count + 0.8, _PANEL)) as canvas:
-        axes: list[Axes] = list(canvas.subplots(1, count, squeeze=False)[0])
-        shown = None
+    columns = min(len(stretch.located), 4)
+    rows = -(-len(stretch.located) // columns)
+    with figure(path, (_PANEL * columns + 0.8, _PANEL * rows)) as canvas:
+        every: list[Axes] = list(canvas.subplots(rows, columns, squeeze=False).ravel())
+        axes, shown = every[: len(stretch.located)], None
+        for ax in every[len(axes) :]:
+            ax.remove()
         for ax, (name, one) in zip(axes, stretch.located.items(), strict=True):
             ax.plot(*stretch.truth.T, color='0.75', lw=5, zorder=1)
             gone = one.positions[~one.kept]
