@@ -8,13 +8,8 @@ from typing import Any
 import numpy as np
 
 from cmrnet_ekf.ekf.consistency import anees, autocorrelation
-from cmrnet_ekf.evaluation.tracking_filters import VehicleTrackingConfig
 from lcd_common import se3
 
-# What the filter is told of networks in stages: they learnt from guesses that are worse than a
-# filter's, and are surer than they say while it holds. By the filter's NEES in town 102, which
-# validates: 7.2 of 6 with a scale of 0.26.
-TOLD = VehicleTrackingConfig(camera_scale=0.31, camera_correlation=1.0)
 _STARTING = 20  # images in which a wrong start is taken away
 _STRETCH = 80  # images: eight seconds, so that a few kilometres make fifty of them
 _GROUP = 50

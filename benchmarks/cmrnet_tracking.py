@@ -8,7 +8,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from benchmarks.camera_errors import TOLD
 from benchmarks.cmrnet_sets import (
     LATER,
     LENGTH_M,
@@ -68,8 +67,7 @@ def part(work: Path, name: str, quick: bool = False) -> dict[str, Any]:
         return {}
     drive, local_map = tracked(work, first, TRACKED_TOWN, 100.0 if quick else TRACKED_M)
     runs = {way: 1 if quick else RUNS_DER if way == 'der' else RUNS for way in chosen}
-    told = TOLD if name == 'refined' else None
-    tracked_by = _run(drive, local_map, chosen, runs, told)
+    tracked_by = _run(drive, local_map, chosen, runs)
     folder = work / 'pictures' / 'cmrnet'
     picture = 'heat' if name == 'vehicle' else f'heat_{name}'
     draw(drive, tracked_by, folder / f'{picture}.png')
@@ -85,7 +83,6 @@ def part(work: Path, name: str, quick: bool = False) -> dict[str, Any]:
             'start': 'uniform within 2 m (1 m in z) and 10 degrees of each axis',
             'speed': 'truth, off by a factor of 1 +- 0.01 a run and 0.1 m/s an image',
             'told': asdict(VehicleTrackingConfig()),
-            'told_of_stages': asdict(TOLD),
         }
     return figures
 
@@ -101,7 +98,7 @@ def _towns(
     together: list[Track] = []
     for town in TOWNS[:1] if quick else TOWNS:
         drive, local_map = tracked(work, first, town, 100.0 if quick else LENGTH_M)
-        tracked_by = _run(drive, local_map, chosen, {'der': 1 if quick else RUNS}, TOLD)
+        tracked_by = _run(drive, local_map, chosen, {'der': 1 if quick else RUNS})
         write_tracks(tracked_by, work / f'{drive.name}_{TRACKS}')
         figures[drive.name] = figures_of(tracked_by['der'])
         together += tracked_by['der']
@@ -109,14 +106,10 @@ def _towns(
 
 
 def _run(
-    drive: TrackingDrive,
-    local_map: LocalMap,
-    chosen: Mapping[str, Way],
-    runs: Mapping[str, int],
-    told: VehicleTrackingConfig | None,
+    drive: TrackingDrive, local_map: LocalMap, chosen: Mapping[str, Way], runs: Mapping[str, int]
 ) -> dict[str, list[Track]]:
     found: dict[str, list[Track]] = defaultdict(list)
     with tqdm(total=sum(runs.values()) * (len(drive) - 1), unit='image', desc='tracking') as bar:
-        for way, one in tracks(drive, local_map, chosen, runs, told=told, progress=bar.update):
+        for way, one in tracks(drive, local_map, chosen, runs, progress=bar.update):
             found[way].append(one)
     return found

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.camera_errors import TOLD, CameraErrors, camera_errors, in_closed_loop
+from benchmarks.camera_errors import CameraErrors, camera_errors, in_closed_loop
 from benchmarks.ekf_drive import ImuRecord, ReferenceDrive, reference_drive, sense
 from cmrnet_ekf.ekf.consistency import anees, autocorrelation, nees
 from cmrnet_ekf.ekf.ekf_settings import EkfSettings, GateConfig, MotionConfig, StartConfig
@@ -23,6 +23,7 @@ from cmrnet_ekf.ekf.observations import (
 )
 from cmrnet_ekf.ekf.update import Verdict
 from cmrnet_ekf.ekf.vehicle_ekf import VehicleEkf
+from cmrnet_ekf.evaluation.tracking_filters import VehicleTrackingConfig
 from lcd_common import se3
 
 MOTION = MotionConfig(
@@ -251,9 +252,10 @@ def section(work: Path, runs: int = 200) -> dict[str, Any]:
     }
     camera = camera_errors(sorted(work.glob(f'*{TRACKS}')))
     if camera is not None:
-        scaled = replace(camera, covariances=TOLD.camera_scale * camera.covariances)
+        told = VehicleTrackingConfig()
+        scaled = replace(camera, covariances=told.camera_scale * camera.covariances)
         figures['with_cmrnet'] = {
             'closed_loop': in_closed_loop(camera),
-            **with_real_errors(scaled, min(runs, _GROUP), TOLD.camera_correlation),
+            **with_real_errors(scaled, min(runs, _GROUP), told.camera_correlation),
         }
     return {'consistency': figures, **speed()}
