@@ -24,6 +24,7 @@ _TRACKED = {
     'thesis.de': "thesis's filter, deep ensemble",
     'thesis.der': "thesis's filter, evidential regression",
 }
+_LOST = ('motion', 'unfiltered', 'thesis.mcd', 'thesis.de', 'thesis.der')
 
 
 def _localized(way: str, what: str) -> WideRow:
@@ -108,7 +109,8 @@ def _held(way: str, what: str) -> WideRow:
                     ('r_median_deg', '°'),
                 )
             ),
-            Cell('{:.1f}', (f'{figures}.nees_mean',)),
+            # Of a vehicle that is lost it says nothing.
+            '' if way in _LOST else Cell('{:.1f}', (f'{figures}.nees_mean',)),
             Cell('{:.0f} of {:.0f}', (f'{figures}.diverged', f'{figures}.runs')),
         ),
     )  # fmt: skip
