@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from lcd_common.errors import ConfigError, DataError
 from lcd_common.setting_changes import changed
 from lcd_common.trajectory import read_tum
 
+_log = logging.getLogger(__name__)
 _EXAMPLES = """
 examples:
   track_cmrnet drive.mcap --map map --networks mcd=runs/mcd der=runs/der --out tracked
@@ -78,6 +80,12 @@ def _track(arguments: argparse.Namespace) -> None:
         for name, one in tracks(drive, local_map, chosen, runs, settings, told, bar.update):
             found[name].append(one)
     figures = {name: figures_of(of_way) for name, of_way in found.items()}
+    blind = [n for n, way in chosen.items() if way.stages and figures[n]['skipped_share'] == 1.0]
+    if blind:
+        _log.warning(
+            '%s never saw the map: are the poses of the drive in its frame? --poses gives others',
+            ', '.join(blind),
+        )
     out.mkdir(parents=True, exist_ok=True)
     facts = {'drive': drive.name, 'filter': arguments.filter, 'ways': figures}
     (out / RESULTS).write_text(json.dumps(facts, indent=1) + '\n')
@@ -137,6 +145,9 @@ def _recorded(arguments: argparse.Namespace, network: CmrnetConfig) -> TrackingD
         recorded = record(folder, drive, poses, network, span, bar.update)
     if recorded.name != drive.name or recorded.images != tuple(network.images):
         raise DataError(f'{folder}: frames of another drive or network; name another folder')
+    at = poses.at(int(recorded.stamps_ns[0]))
+    if at is None or not np.allclose(at, recorded.T_map_base[0], atol=1e-6):
+        raise DataError(f'{folder}: frames recorded with other poses; name another folder')
     return recorded
 
 

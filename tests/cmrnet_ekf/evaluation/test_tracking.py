@@ -28,6 +28,7 @@ from cmrnet_ekf.predictors import Predictor
 from cmrnet_ekf.thesis_ekf import pose_matrix, pose_vector
 from lcd_common import se3
 from lcd_common.errors import ConfigError, DataError
+from lcd_common.trajectory import Trajectory
 
 EXACT = TrackingConfig(speed_scale=0.0, speed_noise=0.0)
 
@@ -256,6 +257,18 @@ def test_the_command_tracks_with_networks(tmp_path, monkeypatch, capsys):
     assert command.main([*line, '--filter', 'vehicle']) == 1
     error = capsys.readouterr().err
     assert 'inertial samples' in error and error.count('\n') == 1, error
+
+
+def test_the_command_says_when_the_map_was_never_in_sight(command_line, tmp_path, caplog, capsys):
+    away = StreetWithCamera().truth()
+    T = away.T_world_body.copy()
+    T[:, 1, 3] += 5000.0
+    Trajectory(away.stamps_ns, T).write_tum(tmp_path / 'away.tum')
+    line = [*command_line, '--networks', 'der=one.safetensors', '--frames', 'kept']
+    assert command.main([*line, '--poses', 'away.tum']) == 0
+    assert 'der never saw the map' in caplog.text
+    assert command.main(line) == 1
+    assert 'recorded with other poses; name another folder' in capsys.readouterr().err
 
 
 def truth_positions():
