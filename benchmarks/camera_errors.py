@@ -12,7 +12,7 @@ from lcd_common import se3
 
 _STARTING = 20  # images in which a wrong start is taken away
 _STRETCH = 80  # images: eight seconds, so that a few kilometres make fifty of them
-_GROUP = 50
+GROUP = 50  # runs that a band is for
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def camera_errors(files: Sequence[Path], way: str = 'der') -> CameraErrors | Non
     """Return the errors of a way of the closed loop; None when it has not been driven.
 
     Runs are cut into stretches of eight seconds. Those of the first seeds come first: no two of
-    one seed show the same place.
+    one seed are of the same part of a drive.
     """
     parts: list[tuple[int, se3.Array, se3.Array, se3.Array]] = []
     for path in files:
@@ -70,9 +70,9 @@ def in_closed_loop(camera: CameraErrors) -> dict[str, Any]:
     whitened = np.linalg.solve(root, xi[..., None])[..., 0]
     own = np.square(whitened).sum(1)
     runs = list(whitened.reshape(*camera.xi.shape[:2], 6))
-    group = anees(camera.nees[:_GROUP])
+    group = anees(camera.nees[:GROUP])
     return {
-        'stretches': len(camera.nees[:_GROUP]),
+        'stretches': len(camera.nees[:GROUP]),
         'stretch_images': _STRETCH,
         'anees_inside_share': group.inside_share,
         'anees_mean': group.mean,

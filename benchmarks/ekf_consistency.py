@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.camera_errors import CameraErrors, camera_errors, in_closed_loop
+from benchmarks.camera_errors import GROUP, CameraErrors, camera_errors, in_closed_loop
 from benchmarks.ekf_drive import ImuRecord, ReferenceDrive, reference_drive, sense
 from cmrnet_ekf.ekf.consistency import anees, autocorrelation, nees
 from cmrnet_ekf.ekf.ekf_settings import EkfSettings, GateConfig, MotionConfig, StartConfig
@@ -37,7 +37,6 @@ GNSS_SIGMAS = np.array([1.5, 1.5, 3.0])
 ANTENNA = np.array([-0.5, 0.3, 1.2])
 SPEED_SIGMA = 0.1
 _SETTLING_S = 2.0
-_GROUP = 50  # runs
 # What the observations in town 102 were, which validates: a mean NEES of 4.36 of 6, and whitened
 # errors of neighbouring images (0.1 s) with a correlation of 0.882.
 _TOLD_SCALE, _TOLD_CORRELATION_S = 4.36 / 6.0, 0.1 / -math.log(0.882)
@@ -177,7 +176,7 @@ def consistency(
 
 def _groups(values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Split runs into groups as large as the band is for, the last one smaller."""
-    return [values[i : i + _GROUP] for i in range(0, len(values), _GROUP)]
+    return [values[i : i + GROUP] for i in range(0, len(values), GROUP)]
 
 
 def speed(samples: int = 20_000) -> dict[str, Any]:
@@ -258,6 +257,6 @@ def section(work: Path, runs: int = 200) -> dict[str, Any]:
         scaled = replace(camera, covariances=_TOLD_SCALE * camera.covariances)
         figures['with_cmrnet'] = {
             'closed_loop': in_closed_loop(camera),
-            **with_real_errors(scaled, min(runs, _GROUP), _TOLD_CORRELATION_S),
+            **with_real_errors(scaled, min(runs, GROUP), _TOLD_CORRELATION_S),
         }
     return {'consistency': figures, **speed()}

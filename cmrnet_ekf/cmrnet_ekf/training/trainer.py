@@ -80,13 +80,13 @@ class Trainer:
         """
         self.settings, self.folder, self._loss = settings, folder, loss
         self._sets = list(sets)
+        rolls = settings.augment and settings.roll > 0.0
         for one in self._sets:
             if one.images != tuple(network.settings.images):
                 raise ConfigError(
                     f'{one.path}: samples of images {one.images}, the network takes '
                     f'{network.settings.images}; make samples for this network'
                 )
-            rolls = settings.augment and settings.roll > 0.0
             if (loss.matching_weight or rolls) and not one.pinhole:
                 raise ConfigError(
                     f'{one.path}: the matching loss and rolled images need images without '
