@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -28,6 +29,23 @@ def figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
         FigureCanvasAgg(canvas)
         yield canvas
         canvas.savefig(path, facecolor='white')
+
+
+@contextmanager
+def panels(
+    path: Path, count: int, columns: int, panel: tuple[float, float]
+) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Yield a figure with a number of panels, each of a size in inches, and write it.
+
+    At most `columns` stand in a row; room for a bar of colours is left beside them.
+    """
+    columns = min(count, columns)
+    rows = -(-count // columns)
+    with figure(path, (panel[0] * columns + 0.8, panel[1] * rows)) as canvas:
+        axes: list[Axes] = list(canvas.subplots(rows, columns, squeeze=False).ravel())
+        for ax in axes[count:]:
+            ax.remove()
+        yield canvas, axes[:count]
 
 
 def colours(names: list[str]) -> dict[str, str]:

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cmrnet_ekf.calibration import AXES, calibration
-from cmrnet_ekf.evaluation.figure import colours, figure
+from cmrnet_ekf.evaluation.figure import colours, figure, panels
 from cmrnet_ekf.evaluation.measures import SHARE, by_confidence, by_count
 from cmrnet_ekf.evaluation.stretch import Stretch
 from cmrnet_ekf.evaluation.study import Study
@@ -115,13 +115,8 @@ def _counts(study: Study, path: Path) -> Path:
 
 def _stretch(stretch: Stretch, path: Path) -> Path:
     """Fig. 5.6: where each method put the frames; what it rejected is grey and hollow."""
-    columns = min(len(stretch.located), 4)
-    rows = -(-len(stretch.located) // columns)
-    with figure(path, (_PANEL * columns + 0.8, _PANEL * rows)) as canvas:
-        every: list[Axes] = list(canvas.subplots(rows, columns, squeeze=False).ravel())
-        axes, shown = every[: len(stretch.located)], None
-        for ax in every[len(axes) :]:
-            ax.remove()
+    with panels(path, len(stretch.located), 4, (_PANEL, _PANEL)) as (canvas, axes):
+        shown = None
         for ax, (name, one) in zip(axes, stretch.located.items(), strict=True):
             ax.plot(*stretch.truth.T, color='0.75', lw=5, zorder=1)
             gone = one.positions[~one.kept]

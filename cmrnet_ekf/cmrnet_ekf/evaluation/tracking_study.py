@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cmrnet_ekf.evaluation.figure import figure
+from cmrnet_ekf.evaluation.figure import panels
 from cmrnet_ekf.evaluation.tables import table
 from cmrnet_ekf.evaluation.tracking import (
     THESIS,
@@ -107,20 +107,15 @@ def markdown(figures: Mapping[str, Mapping[str, Any]], about: str) -> str:
 
 def draw(drive: TrackingDrive, found: Mapping[str, Sequence[Track]], path: Path) -> Path:
     """Draw where each way errs along the drive, in its first run (Fig. 5.7)."""
-    columns = min(len(found), 3)
-    rows = -(-len(found) // columns)
     place = drive.T_map_base[1:, :2, 3]
-    with figure(path, (4.0 * columns + 0.8, 3.8 * rows)) as canvas:
-        every = list(canvas.subplots(rows, columns, squeeze=False).ravel())
-        axes, shown = every[: len(found)], None
+    with panels(path, len(found), 3, (4.0, 3.8)) as (canvas, axes):
+        shown = None
         for ax, (name, of_way) in zip(axes, found.items(), strict=True):
             first = of_way[0]
             shown = ax.scatter(*place.T, c=first.metres, s=7, cmap='inferno_r', vmin=0, vmax=_HOT_M)
             ax.set_aspect('equal', 'datalim')
             ax.set_title(f'{name}: median {np.median(first.metres):.2f} m')
             ax.set(xlabel='x [m]', ylabel='y [m]')
-        for ax in every[len(found) :]:
-            ax.remove()
         if shown is not None:
             canvas.colorbar(shown, ax=axes, label='translation error [m]', extend='max')
     return path
